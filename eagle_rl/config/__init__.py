@@ -1,0 +1,1 @@
+"""Configuration: the one schema and the one loader."""

@@ -1,0 +1,68 @@
+"""Random numbers that depend only on (seed, robot, environment, stream, count), never on who else is drawing.
+
+There is no generator state: each number is a hash of its coordinates (a splitmix64 finalizer per coordinate). So adding
+a robot or an environment moves nobody else's noise, a resumed run needs only its counters, and CPU and GPU agree.
+"""
+
+from __future__ import annotations
+
+import zlib
+
+import torch
+from torch import Tensor
+
+_GOLDEN = -7046029254386353131  # 0x9E3779B97F4A7C15 as a signed 64-bit integer
+_MIX_1 = -4658895280553007687  # 0xBF58476D1CE4E5B9
+_MIX_2 = -7723592293110705685  # 0x94D049BB133111EB
+
+
+def _shift_right(x: Tensor, bits: int) -> Tensor:
+    """Logical right shift of int64."""
+    return (x >> bits) & ((1 << (64 - bits)) - 1)
+
+
+def _mix(x: Tensor) -> Tensor:
+    """Finalizer of splitmix64: a bijection on 64-bit integers that scatters nearby inputs."""
+    x = (x ^ _shift_right(x, 30)) * _MIX_1
+    x = (x ^ _shift_right(x, 27)) * _MIX_2
+    return x ^ _shift_right(x, 31)
+
+
+class CounterRng:
+    """Uniform numbers for a pool of environments."""
+
+    def __init__(self, seed: int, robot_names: list[str], env_indices: Tensor) -> None:
+        """Derive one key per environment.
+
+        Args:
+            seed: seed of the run.
+            robot_names: robot of each environment, length N.
+            env_indices: index of each environment among those of its robot, shape (N,), int64.
+        """
+        names = torch.tensor([zlib.crc32(name.encode()) for name in robot_names], device=env_indices.device)
+        key = _mix(torch.full_like(env_indices, seed) * _GOLDEN + 1)
+        self.key = _mix(_mix(key + names * _GOLDEN) + env_indices * _GOLDEN)
+
+    def uniform(self, stream: str, count: Tensor, size: int, ids: Tensor | None = None) -> Tensor:
+        """Numbers uniform in [0, 1).
+
+        Args:
+            stream: name of what is drawn; different names are independent.
+            count: how often this was drawn before, int64, shape (n,): the coordinate that makes draws differ.
+            size: numbers per environment.
+            ids: environments, shape (n,), or None for all.
+
+        Returns:
+            Float32 tensor, shape (n, size); 24 random bits each.
+        """
+        key = self.key if ids is None else self.key[ids]
+        key = _mix(key + zlib.crc32(stream.encode()) * _GOLDEN) + count * _GOLDEN
+        columns = torch.arange(1, size + 1, device=key.device) * _GOLDEN
+        bits = _shift_right(_mix(_mix(key).unsqueeze(1) + columns), 40)
+        return bits.to(torch.float32) * (1.0 / (1 << 24))
+
+    def uniform_in(
+        self, low: float | Tensor, high: float | Tensor, stream: str, count: Tensor, size: int, ids: Tensor | None = None
+    ) -> Tensor:
+        """Numbers uniform in [low, high), shape (n, size)."""
+        return low + (high - low) * self.uniform(stream, count, size, ids)
