@@ -16,6 +16,11 @@ _MIX_1 = -4658895280553007687  # 0xBF58476D1CE4E5B9
 _MIX_2 = -7723592293110705685  # 0x94D049BB133111EB
 
 
+def _stream_key(stream: str) -> int:
+    """A signed 64-bit integer for a stream's name."""
+    return (zlib.crc32(stream.encode()) * _GOLDEN + 2**63) % 2**64 - 2**63
+
+
 def _shift_right(x: Tensor, bits: int) -> Tensor:
     """Logical right shift of int64."""
     return (x >> bits) & ((1 << (64 - bits)) - 1)
@@ -56,7 +61,7 @@ class CounterRng:
             Float32 tensor, shape (n, size); 24 random bits each.
         """
         key = self.key if ids is None else self.key[ids]
-        key = _mix(key + zlib.crc32(stream.encode()) * _GOLDEN) + count * _GOLDEN
+        key = _mix(key + _stream_key(stream)) + count * _GOLDEN
         columns = torch.arange(1, size + 1, device=key.device) * _GOLDEN
         bits = _shift_right(_mix(_mix(key).unsqueeze(1) + columns), 40)
         return bits.to(torch.float32) * (1.0 / (1 << 24))
