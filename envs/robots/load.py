@@ -273,8 +273,8 @@ def consistency_faults(spec: RobotSpec, tree: Tree) -> list[str]:
     height = default_height(spec, tree)
     if abs(height - spec.nominal_height) > HEIGHT_TOLERANCE:
         faults.append(
-            f"nominal_height_m is {spec.nominal_height:g}, but in the default pose the base is {height:.4f} m above the "
-            "lower sole; correct it, or default_angle_rad, or sole_centre_m"
+            f"nominal_height_m is {spec.nominal_height:g}, but in the default pose the base is {height:.4f} m above "
+            "the lower sole; correct it, or default_angle_rad, or sole_centre_m"
         )
     return faults
 

@@ -50,7 +50,7 @@ def _slices() -> dict[str, slice]:
 SENSOR_SLICES: dict[str, slice] = _slices()
 """Where each block lies in ``sensordata``; each reshapes to (owners, dim):
 
-- ``sole_pos``, ``sole_vel``: (2, 3) position [m] and linear velocity [m/s] of the sole centres, world frame, FEET order;
+- ``sole_pos``, ``sole_vel``: (2, 3) position [m] and velocity [m/s] of the sole centres, world frame, FEET order;
 - ``foot_force``: (2, 3) net contact force between each foot and the floor [N], world frame, see ``FORCE_ON_BODY``;
 - ``contact_force``: (7, 3) net contact force between each of COLLISION_LINKS and anything [N], likewise;
 - ``floor_contact``: (3,) number of contacts of each of FALL_LINKS with the floor.
