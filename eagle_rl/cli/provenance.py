@@ -8,20 +8,13 @@ import platform
 import subprocess
 import sys
 from collections.abc import Iterable
-from datetime import datetime
+from datetime import datetime, timezone
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 from eagle_rl._version import __version__
 from eagle_rl.paths import data_root
-
-if sys.version_info < (3, 11):  # pragma: no cover
-    from datetime import timezone
-
-    UTC = timezone.utc
-else:
-    from datetime import UTC
 
 PACKAGES = ("torch", "rsl-rl-lib", "mujoco", "pin", "numpy", "tensordict", "gymnasium")
 """Packages whose version can change a run's numbers."""
@@ -71,7 +64,7 @@ def provenance(seed: int, robot_files: dict[str, Iterable[Path]], config_hash: s
         config_hash: hash of the resolved configuration.
     """
     return {
-        "created": datetime.now(UTC).isoformat(timespec="seconds"),
+        "created": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         "command": sys.argv,
         "seed": seed,
         "config_hash": config_hash,
