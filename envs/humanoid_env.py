@@ -34,9 +34,8 @@ from .mdp.rewards import RewardContext, compute_rewards, success_scores
 from .mdp.terminations import terminations
 from .pooling import pool_robots, share
 from .rng import CounterRng
-from .robots.embodiment import embodiment_dim, pooled_embodiment
 from .robots.model import build_model
-from .robots.sensors import FORCE_ON_BODY, SENSOR_SLICES
+from .robots.sensors import SENSOR_SLICES
 from .robots.slots import NUM_SLOTS
 from .robots.spec import RobotSpec
 from .sim.batch import RobotBatch
@@ -100,14 +99,8 @@ class HumanoidEnv(VecEnv):
         self.commands = CommandSampler(task.commands, self.robots, len(robots), self.rng, self.step_dt)
         self.aids = LearningAids(task.aids, len(robots), self.device)
         observations = task.observations
-        self.embodiment = (
-            pooled_embodiment(robots, self.robots.robot_id, self.randomizer.bodies, observations.descriptor)
-            if observations.embodiment_observation
-            else None
-        )
-        self.layout = ObservationLayout(
-            observations, embodiment_dim(observations.descriptor) if self.embodiment is not None else 0
-        )
+        self.embodiment = None
+        self.layout = ObservationLayout(observations, 0)
         self.mirror = self.layout.mirror(self.device)
         self._noise = noise_scale(observations, self.robots)
         self._log = StepLog(self.robot_names, self.robots.robot_id)
@@ -236,10 +229,10 @@ class HumanoidEnv(VecEnv):
             joint_torque=staged[:, columns["joint_torque"]],
             foot_pos_w=foot_pos,
             foot_vel_w=sensor("sole_vel", 2, 3),
-            foot_force_w=FORCE_ON_BODY * sensor("foot_force", 2, 3),
+            foot_force_w=sensor("foot_force", 2, 3),
             foot_height=foot_pos[..., 2],
             last_foot_contact=of(self._last_contact),
-            link_force_w=FORCE_ON_BODY * sensor("contact_force", 7, 3),
+            link_force_w=sensor("contact_force", 7, 3),
             ground_contact=sensor("floor_contact", 3).gt(0).any(dim=1),
             height_scan=staged.new_zeros(len(staged), self.layout.num_scan_points),
             friction=of(self.randomizer.friction),
@@ -270,7 +263,7 @@ class HumanoidEnv(VecEnv):
         """Push the frame of the present state, delayed and corrupted, into the history."""
         cfg = self.task.observations
         frame = proprioception(self.state, self.robots, cfg)
-        sensed = delay(frame, self._last_frame, self.randomizer.latency, cfg)
+        sensed = delay(frame, self._last_frame, self.randomizer.latency)
         if cfg.enable_corruption:
             noise = self.rng.uniform("observation_noise", self.step_count, frame.shape[1])
             sensed = sensed + (2.0 * noise - 1.0).to(frame.dtype) * self._noise
