@@ -19,23 +19,24 @@ _SNAP = 0.01
 """Scale under which an aid is off [-]."""
 _GRAVITY = 9.81
 
-# The harness, per kilogram of robot; the first is 200 N m/rad for a robot of 33 kg.
-_TILT_STIFFNESS = 200.0 / 33.0
+# The harness, per kilogram of robot. With random actions of standard deviation 0.7 the five robots fall about once in
+# 1000 steps, against 17 times without it; two thirds of the stiffness and less than half the torque leave 10 falls.
+_TILT_STIFFNESS = 300.0 / 33.0
 """[N m/rad/kg]"""
 _TILT_DAMPING = 2.5 / 33.0
 """[N m s/rad/kg]; explicit over a control step of 0.02 s, so it must stay below I / dt: a pelvis held by the damping of
 its joints acts like 0.1 kg m^2, which allows 5 N m s/rad at 33 kg."""
-_MAX_TILT_TORQUE = 60.0 / 33.0
+_MAX_TILT_TORQUE = 150.0 / 33.0
 """[N m/kg]"""
-_MAX_DAMPING_TORQUE = 10.0 / 33.0
+_MAX_DAMPING_TORQUE = 25.0 / 33.0
 """[N m/kg]"""
 _HEIGHT_STIFFNESS = 50.0
 """[N/m/kg]: full support 0.1 m below the commanded height."""
 _MAX_SUPPORT = 0.5
 """Share of the weight the harness carries at most [-]."""
-_DRAG = 1.0
+_DRAG = 2.0
 """[N s/m/kg]"""
-_MAX_DRAG = 0.15
+_MAX_DRAG = 0.2
 """Bound on the drag as a share of the weight [-]."""
 
 
