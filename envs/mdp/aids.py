@@ -19,16 +19,14 @@ _SNAP = 0.01
 """Scale under which an aid is off [-]."""
 _GRAVITY = 9.81
 
-# The harness, per kilogram of robot; the first is 200 N m/rad for a robot of 33 kg.
-_TILT_STIFFNESS = 200.0 / 33.0
+# The harness, per kilogram of robot; a robot topples with about m g h = 7 N m/rad/kg.
+_TILT_STIFFNESS = 400.0 / 33.0
 """[N m/rad/kg]"""
-_TILT_DAMPING = 2.5 / 33.0
-"""[N m s/rad/kg]; explicit over a control step of 0.02 s, so it must stay below I / dt: a pelvis held by the damping of
-its joints acts like 0.1 kg m^2, which allows 5 N m s/rad at 33 kg."""
-_MAX_TILT_TORQUE = 60.0 / 33.0
+_MAX_TILT_TORQUE = 120.0 / 33.0
 """[N m/kg]"""
-_MAX_DAMPING_TORQUE = 10.0 / 33.0
-"""[N m/kg]"""
+_TILT_DAMPING = 12.0 / 33.0
+"""[N m s/rad/kg]; part of the physics step and so implicit: as a torque held over a control step it would shake a light
+pelvis apart."""
 _HEIGHT_STIFFNESS = 50.0
 """[N/m/kg]: full support 0.1 m below the commanded height."""
 _MAX_SUPPORT = 0.5
@@ -93,9 +91,7 @@ def _bounded(x: Tensor, bound: Tensor) -> Tensor:
 def _tilt_torque(state: PooledState, mass: Tensor) -> Tensor:
     """Torque toward zero roll and the commanded pitch in the yaw frame [N m], shape (N, 2)."""
     error = torch.stack((state.base_roll, state.base_pitch - state.command[:, 4]), dim=1)
-    spring = _bounded(-_TILT_STIFFNESS * mass * error, _MAX_TILT_TORQUE * mass)
-    damping = _bounded(-_TILT_DAMPING * mass * state.base_ang_vel_b[:, :2], _MAX_DAMPING_TORQUE * mass)
-    return spring + damping
+    return _bounded(-_TILT_STIFFNESS * mass * error, _MAX_TILT_TORQUE * mass)
 
 
 def _force(state: PooledState, robots: PooledRobots, mass: Tensor) -> Tensor:
@@ -125,3 +121,8 @@ def harness_wrench(state: PooledState, robots: PooledRobots, scale: Tensor) -> T
     wrench = rotate_yaw(yaw, torch.stack((_force(state, robots, mass), torque), dim=1)).flatten(1)
     scale = scale.to(wrench.dtype).unsqueeze(1)
     return torch.where(scale > 0.0, wrench * scale, 0.0)
+
+
+def harness_damping(robots: PooledRobots, scale: Tensor) -> Tensor:
+    """Damping of the bases' rotation by the harness [N m s/rad], shape (N,)."""
+    return _TILT_DAMPING * robots.total_mass * scale
