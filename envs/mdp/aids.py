@@ -15,6 +15,8 @@ from eagle_rl.config.schema import AidsCfg
 from ..geometry import rotate_yaw, yaw_of
 from ..state import PooledRobots, PooledState
 
+_SMOOTHING = 0.05
+"""Share of the newest interval in the running means that decide about decay [-]; few environments make it noisy."""
 _SNAP = 0.01
 """Scale under which an aid is off [-]."""
 _GRAVITY = 9.81
@@ -40,6 +42,8 @@ _MAX_DRAG = 0.15
 class LearningAids:
     """Scales of both aids, one per robot."""
 
+    _STATE = ("harness", "gait_shaping", "_episode_ratio", "_contact_match")
+
     def __init__(self, cfg: AidsCfg, num_robots: int, device: torch.device | str = "cpu") -> None:
         """Start both aids at their configured scales."""
         self.cfg = cfg
@@ -47,6 +51,8 @@ class LearningAids:
         """Scale of the harness, shape (R,)."""
         self.gait_shaping = torch.full((num_robots,), cfg.gait_shaping, dtype=torch.float64, device=device)
         """Scale s of gait shaping, shape (R,)."""
+        self._episode_ratio = torch.zeros_like(self.harness)
+        self._contact_match = torch.zeros_like(self.harness)
 
     def update(self, episode_ratio: Tensor, contact_match: Tensor) -> None:
         """Decay what is no longer needed; call once per ``interval_steps``.
@@ -56,17 +62,20 @@ class LearningAids:
             contact_match: share of steps in which its feet agree with the clock, shape (R,).
         """
         cfg = self.cfg
-        self.harness = _decayed(self.harness, episode_ratio >= cfg.min_episode_ratio, cfg.harness_decay)
-        self.gait_shaping = _decayed(self.gait_shaping, contact_match >= cfg.min_contact_match, cfg.gait_shaping_decay)
+        self._episode_ratio = torch.lerp(self._episode_ratio, episode_ratio.to(self._episode_ratio), _SMOOTHING)
+        self._contact_match = torch.lerp(self._contact_match, contact_match.to(self._contact_match), _SMOOTHING)
+        stands, walks = self._episode_ratio >= cfg.min_episode_ratio, self._contact_match >= cfg.min_contact_match
+        self.harness = _decayed(self.harness, stands, cfg.harness_decay)
+        self.gait_shaping = _decayed(self.gait_shaping, walks, cfg.gait_shaping_decay)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Both scales."""
-        return {"harness": self.harness.clone(), "gait_shaping": self.gait_shaping.clone()}
+        """Both scales and the running means that decide about their decay."""
+        return {name: getattr(self, name).clone() for name in self._STATE}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Restore what :meth:`state_dict` returned."""
-        self.harness = state["harness"].to(self.harness)
-        self.gait_shaping = state["gait_shaping"].to(self.gait_shaping)
+        for name in self._STATE:
+            setattr(self, name, state[name].to(self.harness))
 
     def log(self, robot_names: Sequence[str]) -> dict[str, float]:
         """Both scales of every robot."""
