@@ -34,6 +34,7 @@ from .mdp.rewards import RewardContext, compute_rewards, success_scores
 from .mdp.terminations import terminations
 from .pooling import pool_robots, share
 from .rng import CounterRng
+from .robots.embodiment import embodiment_dim, pooled_embodiment
 from .robots.model import build_model
 from .robots.sensors import SENSOR_SLICES
 from .robots.slots import NUM_SLOTS
@@ -99,8 +100,14 @@ class HumanoidEnv(VecEnv):
         self.commands = CommandSampler(task.commands, self.robots, len(robots), self.rng, self.step_dt)
         self.aids = LearningAids(task.aids, len(robots), self.device)
         observations = task.observations
-        self.embodiment = None
-        self.layout = ObservationLayout(observations, 0)
+        self.embodiment = (
+            pooled_embodiment(robots, self.robots.robot_id, self.randomizer.bodies, observations.descriptor)
+            if observations.embodiment_observation
+            else None
+        )
+        self.layout = ObservationLayout(
+            observations, embodiment_dim(observations.descriptor) if self.embodiment is not None else 0
+        )
         self.mirror = self.layout.mirror(self.device)
         self._noise = noise_scale(observations, self.robots)
         self._log = StepLog(self.robot_names, self.robots.robot_id)

@@ -37,7 +37,8 @@ class Mirror:
         """Mirror of columns laid side by side."""
         perm: list[int] = []
         for mirror in mirrors:
-            perm.extend(len(perm) + i for i in mirror.perm)
+            start = len(perm)
+            perm.extend(start + i for i in mirror.perm)
         return Mirror(tuple(perm), tuple(s for mirror in mirrors for s in mirror.sign))
 
     @staticmethod

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,26 +12,14 @@ from eagle_rl.config.schema import RandomizationCfg
 
 from ..geometry import quat_from_yaw
 from ..rng import CounterRng
+from ..robots.embodiment import EMBODIMENT_LINKS, BodyChanges
 from ..robots.slots import NUM_SLOTS
 from ..sim.pool import PhysicsPool
 from ..state import PooledRobots
 
 NOMINAL_FRICTION = 1.0
-_EMBODIMENT_LINKS = ("torso", "left_foot", "right_foot")
 SPAWN_CLEARANCE = 0.04
 """Height above the default pose at which a robot is spawned [m] (HugWBC 2)."""
-
-
-@dataclass
-class BodyChanges:
-    """What randomization did to the links that o_ea describes (torso, left foot, right foot)."""
-
-    mass_scale: Tensor
-    """Factor on mass and inertia, shape (N, 3)."""
-    added_mass: Tensor
-    """Mass added at the centre of mass [kg], shape (N, 3)."""
-    com_offset: Tensor
-    """Shift of the centre of mass [m], shape (N, 3, 3)."""
 
 
 class Randomizer:
@@ -100,7 +87,9 @@ class Randomizer:
         if len(ids) == 0:
             return
         u = 2.0 * self._rng.uniform("push", steps[ids], 6, ids) - 1.0
-        self._pool.push(ids, u[:, :3] * self.cfg.push_lin_vel * penalty_scale, u[:, 3:] * self.cfg.push_ang_vel * penalty_scale)
+        self._pool.push(
+            ids, u[:, :3] * self.cfg.push_lin_vel * penalty_scale, u[:, 3:] * self.cfg.push_ang_vel * penalty_scale
+        )
 
     def state_dict(self) -> dict[str, Any]:
         """The draws in force; those made at creation follow from the seed."""
@@ -128,7 +117,7 @@ class Randomizer:
     def _randomize_bodies(self) -> BodyChanges:
         """Scale masses and shift centres of mass of every body of every environment, once."""
         mass = self._robots.total_mass
-        shape = (len(mass), len(_EMBODIMENT_LINKS))
+        shape = (len(mass), len(EMBODIMENT_LINKS))
         changes = BodyChanges(mass.new_ones(shape), mass.new_zeros(shape), mass.new_zeros(*shape, 3))
         if not self.cfg.enabled:
             return changes
@@ -146,7 +135,7 @@ class Randomizer:
             added[:, base] = payload * batch.spec.total_mass
             offset[:, base, :2] += shift
             batch.scale_bodies(*(x.to("cpu", torch.float64).numpy() for x in (scale, added, offset)))
-            bodies = [model.body(batch.spec.link_roles[role]).id for role in _EMBODIMENT_LINKS]
+            bodies = [model.body(batch.spec.link_roles[role]).id for role in EMBODIMENT_LINKS]
             changes.mass_scale[rows] = scale[:, bodies].to(mass.dtype)
             changes.added_mass[rows] = added[:, bodies].to(mass.dtype)
             changes.com_offset[rows] = offset[:, bodies].to(mass.dtype)

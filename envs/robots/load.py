@@ -21,7 +21,17 @@ from .urdf import MAX_FILE_BYTES, MAX_VALUE, read_urdf
 ROLES = tuple(dict.fromkeys((*FALL_LINKS, "left_foot", "right_foot", "left_hand", "right_hand", *COLLISION_LINKS)))
 """Every role a robot's links must fill."""
 
-REQUIRED = ("name", "title", "urdf", "base_link", "roles", "sole_centre_m", "nominal_height_m", "swing_height_m", "joints")
+REQUIRED = (
+    "name",
+    "title",
+    "urdf",
+    "base_link",
+    "roles",
+    "sole_centre_m",
+    "nominal_height_m",
+    "swing_height_m",
+    "joints",
+)
 OPTIONAL = ("imu", "collision_excludes", "sources", "mesh_dir")
 IMU_KEYS = ("link", "offset_m")
 JOINT_NUMBERS = {
@@ -78,7 +88,7 @@ class _StrictLoader(yaml.SafeLoader):
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
         if self.check_event(yaml.AliasEvent):
-            raise yaml.composer.ComposerError(None, None, "aliases are not allowed", self.peek_event().start_mark)
+            raise yaml.composer.ComposerError(None, None, "aliases are not allowed", None)
         return super().compose_node(parent, index)
 
 
@@ -175,7 +185,9 @@ class _Draft:
     def _link(self, value: object, where: str, tree: Tree) -> str:
         """Resolve a link to the body that carries it."""
         if value not in tree.link_names:
-            self.faults.append(f"{where}: no link {value!r:.80} in the URDF.{did_you_mean(str(value), tree.link_names)}")
+            self.faults.append(
+                f"{where}: no link {value!r:.80} in the URDF.{did_you_mean(str(value), tree.link_names)}"
+            )
             return tree.bodies[0].name
         return tree.locate(str(value))[0].name
 
@@ -184,7 +196,9 @@ class _Draft:
         roles = self._mapping(data.get("roles"), "roles", ROLES)
         soles = self._mapping(data.get("sole_centre_m"), "sole_centre_m", FEET)
         if data.get("base_link") != tree.bodies[0].name:
-            self.faults.append(f"base_link is {data.get('base_link')!r:.80}, but the URDF's root is {tree.bodies[0].name}")
+            self.faults.append(
+                f"base_link is {data.get('base_link')!r:.80}, but the URDF's root is {tree.bodies[0].name}"
+            )
         imu = self._mapping(data.get("imu", {"link": tree.bodies[0].name, "offset_m": [0, 0, 0]}), "imu", IMU_KEYS)
         imu_link = self._link(imu.get("link"), "imu.link", tree)
         return {
@@ -211,7 +225,9 @@ class _Draft:
         if not isinstance(pairs, list) or not all(isinstance(pair, list) and len(pair) == 2 for pair in pairs):
             self.faults.append(f"collision_excludes is {pairs!r:.80}, expected a list of pairs of links")
             return ()
-        return tuple((self._link(a, "collision_excludes", tree), self._link(b, "collision_excludes", tree)) for a, b in pairs)
+        return tuple(
+            (self._link(a, "collision_excludes", tree), self._link(b, "collision_excludes", tree)) for a, b in pairs
+        )
 
     def _joints(self, tree: Tree) -> dict[str, Any]:
         names = tuple(joint.name for joint in tree.joints)
@@ -257,8 +273,8 @@ def consistency_faults(spec: RobotSpec, tree: Tree) -> list[str]:
     height = default_height(spec, tree)
     if abs(height - spec.nominal_height) > HEIGHT_TOLERANCE:
         faults.append(
-            f"nominal_height_m is {spec.nominal_height:g}, but in the default pose the base is {height:.4f} m above the "
-            "lower sole; correct it, or default_angle_rad, or sole_centre_m"
+            f"nominal_height_m is {spec.nominal_height:g}, but in the default pose the base is {height:.4f} m above "
+            "the lower sole; correct it, or default_angle_rad, or sole_centre_m"
         )
     return faults
 

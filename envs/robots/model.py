@@ -13,7 +13,7 @@ from .spec import Array, RobotSpec
 from .tree import Body, Shape
 from .urdf import read_urdf
 
-__all__ = ["KEYFRAME", "NUM_SENSORS", "SENSOR_SLICES", "add_floor", "build_model", "build_spec"]
+__all__ = ["KEYFRAME", "NUM_SENSORS", "SENSOR_SLICES", "add_floor", "build_model", "build_spec", "set_options"]
 
 KEYFRAME = "default"
 """Name of the keyframe that holds the default pose."""
@@ -50,7 +50,7 @@ def build_spec(spec: RobotSpec, sim: SimCfg, *, visuals: bool = False) -> mujoco
     """Build the robot alone, without floor or sensors, so that several can be attached to one scene."""
     world = mujoco.MjSpec()
     world.modelname = spec.name
-    _set_options(world, sim)
+    set_options(world, sim)
     tree = read_urdf(spec.urdf_path)
     bodies: list[mujoco.MjsBody] = []
     for body in tree.bodies:
@@ -95,7 +95,8 @@ def add_floor(world: mujoco.MjSpec, heightfield: HeightField | None = None) -> N
     floor.type, floor.hfieldname, floor.pos = mujoco.mjtGeom.mjGEOM_HFIELD, FLOOR, [0.0, 0.0, low]
 
 
-def _set_options(world: mujoco.MjSpec, sim: SimCfg) -> None:
+def set_options(world: mujoco.MjSpec, sim: SimCfg) -> None:
+    """Set solver and integrator; a scene that robots are attached to needs the same options as they have."""
     world.compiler.degree = False
     world.compiler.balanceinertia = False
     option = world.option

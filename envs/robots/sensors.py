@@ -50,11 +50,14 @@ def _slices() -> dict[str, slice]:
 SENSOR_SLICES: dict[str, slice] = _slices()
 """Where each block lies in ``sensordata``; each reshapes to (owners, dim):
 
-- ``sole_pos``, ``sole_vel``: (2, 3) position [m] and linear velocity [m/s] of the sole centres, world frame, FEET order;
-- ``foot_force``: (2, 3) net contact force of the floor on each foot [N], world frame, so z is positive in stance;
-- ``contact_force``: (7, 3) net contact force of each of COLLISION_LINKS on whatever it touches [N], world frame;
+- ``sole_pos``, ``sole_vel``: (2, 3) position [m] and velocity [m/s] of the sole centres, world frame, FEET order;
+- ``foot_force``: (2, 3) net contact force between each foot and the floor [N], world frame, see ``FORCE_ON_BODY``;
+- ``contact_force``: (7, 3) net contact force between each of COLLISION_LINKS and anything [N], likewise;
 - ``floor_contact``: (3,) number of contacts of each of FALL_LINKS with the floor.
 """
+
+FORCE_ON_BODY = -1.0
+"""Factor that turns a sensed contact force into the force on the body: MuJoCo gives what the body does to the other."""
 
 NUM_SENSORS: int = SENSOR_SLICES[_BLOCKS[-1].name].stop
 """Length of ``sensordata``."""
@@ -74,12 +77,12 @@ def add_sensors(world: mujoco.MjSpec, spec: RobotSpec) -> None:
 
 
 def _add_contact(world: mujoco.MjSpec, field: int, *, on: str, floor_only: bool) -> None:
-    """Sense what happens to body ``on``. MuJoCo reports the force of the first object on the second."""
-    body = mujoco.mjtObj.mjOBJ_BODY
-    floor = {"objtype": mujoco.mjtObj.mjOBJ_GEOM, "objname": FLOOR, "reftype": body, "refname": on}
-    anything = {"objtype": body, "objname": on}
+    """Sense what happens to body ``on``."""
+    against = {"reftype": mujoco.mjtObj.mjOBJ_GEOM, "refname": FLOOR} if floor_only else {}
     world.add_sensor(
         type=mujoco.mjtSensor.mjSENS_CONTACT,
+        objtype=mujoco.mjtObj.mjOBJ_BODY,
+        objname=on,
         intprm=[field, _REDUCE_NETFORCE, 1],
-        **(floor if floor_only else anything),
+        **against,
     )

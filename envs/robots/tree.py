@@ -11,6 +11,8 @@ import numpy as np
 
 from .spec import Array
 
+ShapeKind = Literal["box", "sphere", "capsule"]
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Pose:
@@ -52,7 +54,7 @@ class Shape:
     is read as the capsule whose hemispheres sit on the cylinder's two end faces.
     """
 
-    kind: Literal["box", "sphere", "capsule"]
+    kind: ShapeKind
     size: tuple[float, ...]
     pose: Pose
     rgba: tuple[float, float, float, float]
@@ -167,16 +169,14 @@ def merge_fixed(name: str, links: dict[str, Link], joints: Sequence[Joint], root
     members: list[dict[str, Pose]] = []
     stack: list[tuple[str, Joint | None, int, Pose]] = [(root, None, -1, IDENTITY)]
     while stack:
-        link, joint, owner, pose = stack.pop()
-        if joint is None or not joint.fixed:
-            heads.append((joint, owner, pose))
+        link, moved_by, owner, pose = stack.pop()
+        if moved_by is None or not moved_by.fixed:
+            heads.append((moved_by, owner, pose))
             members.append({})
             owner, pose = len(heads) - 1, IDENTITY
         members[owner][link] = pose
         stack.extend((child.child, child, owner, pose @ child.pose) for child in reversed(children[link]))
-    bodies = (
-        _merged(joint, owner, pose, links, parts) for (joint, owner, pose), parts in zip(heads, members, strict=True)
-    )
+    bodies = [_merged(*head, links, parts) for head, parts in zip(heads, members, strict=True)]
     return Tree(name=name, bodies=tuple(bodies))
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from eagle_rl.errors import RobotError, did_you_mean
 
 from .spec import Array
-from .tree import IDENTITY, Inertial, Joint, Link, Pose, Shape, Tree, merge_fixed, rpy_rotation
+from .tree import IDENTITY, Inertial, Joint, Link, Pose, Shape, ShapeKind, Tree, merge_fixed, rpy_rotation
 
 MAX_FILE_BYTES = 10_000_000
 MAX_LINKS = 500
@@ -33,6 +33,12 @@ Rgba = tuple[float, float, float, float]
 Named = TypeVar("Named", Link, Joint)
 
 _DECLARATION = re.compile(r"<!(DOCTYPE|ENTITY|ELEMENT|ATTLIST|NOTATION)", re.IGNORECASE)
+_PRIMITIVES: tuple[tuple[str, ShapeKind, tuple[tuple[str, int, float], ...]], ...] = (
+    ("box", "box", (("size", 3, 0.5),)),
+    ("sphere", "sphere", (("radius", 1, 1.0),)),
+    ("cylinder", "capsule", (("radius", 1, 1.0), ("length", 1, 0.5))),
+)
+"""URDF tag, our kind, and its attributes: name, how many numbers, factor to the half sizes of ``Shape``."""
 _GREY: Rgba = (0.6, 0.6, 0.6, 1.0)
 
 
@@ -136,24 +142,17 @@ class _Reader:
 
     def _shape(self, element: ET.Element, visual: bool, colours: dict[str, Rgba], where: str) -> Shape | None:
         geometry = element.find("geometry")
-        if geometry is None:
-            return None
-        for kind, attributes in (("box", ("size",)), ("sphere", ("radius",)), ("cylinder", ("radius", "length"))):
-            primitive = geometry.find(kind)
+        for tag, kind, attributes in _PRIMITIVES:
+            primitive = None if geometry is None else geometry.find(tag)
             if primitive is None:
                 continue
-            size = np.concatenate(
-                [self._numbers(primitive, key, 3 if key == "size" else 1, "", where, MAX_LENGTH) for key in attributes]
-            )
-            if np.any(size <= 0.0):
-                self.faults.append(f"{where}: a {kind} has size {size.tolist()}, expected positive numbers")
-            if kind == "box":
-                size = size / 2.0
-            if kind == "cylinder":
-                size[1] /= 2.0
+            parts = [self._numbers(primitive, key, count, "", where, MAX_LENGTH) for key, count, _ in attributes]
+            if any(np.any(part <= 0.0) for part in parts):
+                self.faults.append(f"{where}: a {tag} of size {[p.tolist() for p in parts]}, expected positive numbers")
+            halves = [part * factor for part, (_, _, factor) in zip(parts, attributes, strict=True)]
             return Shape(
-                kind="capsule" if kind == "cylinder" else kind,
-                size=tuple(size.tolist()),
+                kind=kind,
+                size=tuple(np.concatenate(halves).tolist()),
                 pose=self._pose(element, where),
                 rgba=self._rgba(element.find("material"), colours),
                 visual=visual,
