@@ -1,1 +1,1 @@
-"""Training: the extended on-policy runner, checkpoints, and the stages of Algorithm 1."""
+"""Runs: the training loop, its checkpoints and its logs."""
