@@ -10,7 +10,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from eagle_rl.errors import CheckpointError, ConfigError
 from eagle_rl.runners.checkpoint import verify_checkpoint, write_atomically
@@ -94,13 +94,22 @@ def open_plan(
     write_atomically(path, json.dumps(plan, indent=1).encode())
 
 
-def read_plan(run_dir: Path) -> list[Stage]:
-    """The planned stages of a run."""
+def _read_plan_file(run_dir: Path) -> dict[str, Any]:
     path = run_dir / "plan.json"
     if not path.exists():
         raise ConfigError(f"{run_dir}: no plan.json, so this is no run of an experiment.")
-    stages = json.loads(path.read_text(encoding="utf-8"))["stages"]
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def read_plan(run_dir: Path) -> list[Stage]:
+    """The planned stages of a run."""
+    stages = _read_plan_file(run_dir)["stages"]
     return [Stage(**{**s, "robots": tuple(s["robots"]), "teachers": tuple(s["teachers"])}) for s in stages]
+
+
+def read_tolerance(run_dir: Path) -> float:
+    """The gain under which a run's rounds stop."""
+    return float(_read_plan_file(run_dir)["provenance"]["config"]["plan"]["tolerance"])
 
 
 def converged_round(stages: Sequence[Stage], records: Mapping[str, Record], tolerance: float) -> int | None:

@@ -20,7 +20,7 @@ from eagle_rl.config.schema import EvaluationCfg, ExperimentCfg
 from eagle_rl.evaluation.evaluate import EvaluationResult, evaluate
 from eagle_rl.evaluation.report import pooled_score
 from eagle_rl.runners.checkpoint import load_actor, load_checkpoint, read_manifest
-from eagle_rl.runners.claims import Claim
+from eagle_rl.runners.claims import Claim, ClaimLostError
 from eagle_rl.runners.plan import Stage, plan_stages
 from eagle_rl.runners.provenance import Provenance
 from eagle_rl.runners.records import (
@@ -132,21 +132,25 @@ class Worker:
         return {stage.name: read_record(self.run_dir, stage.name) for stage in self.stages}
 
     def _claim_and_run(self, stage: Stage, console: Console | None) -> bool:
-        """Run a stage unless someone else does; whether it was run."""
+        """Run a stage unless someone else does; whether anything was done."""
         claim = Claim.acquire(stage_dir(self.run_dir, stage.name))
         if claim is None:
             return False
         with claim:
-            if read_record(self.run_dir, stage.name).state != "done":
-                record = self._run(stage)
+            if read_record(self.run_dir, stage.name).state == "done":
+                return True
+            try:
+                record = self._run(stage, claim)
                 claim.check()
-                write_record(self.run_dir, stage.name, record)
-                if console is not None:
-                    score = "" if record.score is None else f", tracking score {record.score:.3f}"
-                    console.print(f"{stage.name}: done, {record.env_steps:,} environment steps{score}", highlight=False)
+            except ClaimLostError:
+                return True
+            write_record(self.run_dir, stage.name, record)
+        if console is not None:
+            score = "" if record.score is None else f", tracking score {record.score:.3f}"
+            console.print(f"{stage.name}: done, {record.env_steps:,} environment steps{score}", highlight=False)
         return True
 
-    def _run(self, stage: Stage) -> Record:
+    def _run(self, stage: Stage, claim: Claim) -> Record:
         """Train and judge a stage; the record of it done."""
         inputs = {name: final_checkpoint(self.run_dir, name) for name in stage.inputs}
         hashes = {name: read_manifest(path)["sha256"] for name, path in inputs.items()}
@@ -160,6 +164,7 @@ class Worker:
             teachers=tuple(inputs[name] for name in stage.teachers),
             make_env=self.make_env,
             provenance=self._provenance(stage, cfg, hashes),
+            check_claim=claim.check,
             allow_drift=self.allow_drift,
         )
         checkpoint = train(job)

@@ -37,6 +37,8 @@ class Job:
     """Final checkpoint of each robot's specialist."""
     make_env: MakeEnv
     provenance: Provenance
+    check_claim: Callable[[], None]
+    """Raises once another process has taken the stage over."""
     allow_drift: bool = False
 
 
@@ -59,7 +61,8 @@ def train(job: Job) -> Path:
         runner.load(latest, allow_drift=job.allow_drift)
     elif job.init is not None:
         runner.load_weights(job.init)
-    runner.learn(job.stage.iterations - runner.current_learning_iteration)
+    left = job.stage.iterations - runner.current_learning_iteration
+    runner.learn(left, on_iteration=lambda iteration: job.check_claim())
     return checkpoints / f"model_{job.stage.iterations}.pt"
 
 
@@ -70,7 +73,7 @@ def _make_runner(job: Job) -> EagleRunner:
     history = cfg.task.observations.history_length
     train_cfg = make_train_cfg(cfg.algo, cfg.run, history_length=history, seed=stage.seed)
     runner = EagleRunner(env, train_cfg, job.folder, cfg.run.device, job.provenance)
-    if job.teachers:
+    if stage.imitation is not None:
         runner.imitate([load_actor(path)[0] for path in job.teachers], stage.imitation)
     return runner
 

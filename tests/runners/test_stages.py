@@ -10,6 +10,7 @@ import torch
 from eagle_rl.errors import CheckpointError, ConfigError
 from eagle_rl.evaluation.evaluate import EvaluationResult
 from eagle_rl.runners.checkpoint import load_checkpoint
+from eagle_rl.runners.claims import Claim, ClaimLostError
 from eagle_rl.runners.records import read_record, stage_dir
 from eagle_rl.runners.stages import run_experiment
 from tests.runners.toy_run import ENVS, STEPS, make_toy_env, parameters, toy_experiment
@@ -79,7 +80,7 @@ def test_a_run_is_not_overwritten_without_resume(finished):
 
 
 def test_resume_with_another_configuration_lists_what_changed(finished):
-    with pytest.raises(ConfigError, match="plan.distill_env_steps: 144 -> 7"):
+    with pytest.raises(ConfigError, match=r"plan\.distill_env_steps: 144 -> 7"):
         run_experiment(toy_experiment(distill_env_steps=7), finished.run_dir, make_toy_env, resume=True)
 
 
@@ -87,6 +88,21 @@ def test_two_workers_reach_the_same_parameters_as_one(finished, tmp_path):
     both = run_experiment(toy_experiment(), tmp_path / "run", make_toy_env, jobs=2)
     one, two = parameters(finished), parameters(both)
     assert all(torch.equal(one[key], two[key]) for key in one)
+
+
+def test_a_worker_whose_stage_was_taken_over_leaves_it_unrecorded_and_goes_on(tmp_path, monkeypatch):
+    check, lost = Claim.check, []
+
+    def lose_once(claim):
+        if not lost:
+            lost.append(read_record(tmp_path, "generalist").state)
+            raise ClaimLostError
+        check(claim)
+
+    monkeypatch.setattr(Claim, "check", lose_once)
+    result = run_experiment(toy_experiment(iterations=1, judge_envs=0), tmp_path, make_toy_env)
+    assert lost == ["training"]
+    assert result.records["round1/distill"].state == "done"
 
 
 def test_rounds_stop_when_the_score_no_longer_improves(tmp_path):
@@ -138,7 +154,7 @@ def test_a_damaged_input_is_refused_by_name(tmp_path):
 
 
 def test_a_missing_root_is_named(tmp_path):
-    with pytest.raises(CheckpointError, match="plan.root"):
+    with pytest.raises(CheckpointError, match=r"plan\.root"):
         run_experiment(toy_experiment(method="ppo", root="nowhere.pt"), tmp_path / "run", make_toy_env)
 
 
