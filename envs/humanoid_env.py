@@ -14,7 +14,7 @@ from torch import Tensor
 from eagle_rl.config.schema import TaskCfg
 
 from .geometry import rotate_inverse
-from .mdp.aids import LearningAids, harness_wrench
+from .mdp.aids import LearningAids, harness_damping, harness_wrench
 from .mdp.commands import CommandSampler
 from .mdp.curriculum import penalty_scale
 from .mdp.gait import advance_phase, clock, contact_probability, foot_phases
@@ -42,7 +42,7 @@ from .robots.spec import RobotSpec
 from .sim.batch import RobotBatch
 from .sim.pool import PhysicsPool
 from .state import PooledState
-from .step_log import StepLog
+from .step_log import StepLog, episode_ratio
 
 LOG_INTERVAL = 24
 """Control steps between entries in ``extras["log"]``."""
@@ -114,6 +114,7 @@ class HumanoidEnv(VecEnv):
         self._all = torch.arange(num_envs, device=self.device)
         self._pinned: Tensor | None = None
         self._allocate(dtype)
+        self._set_harness_damping()
         self._reset(self._all)
 
     def _allocate(self, dtype: torch.dtype) -> None:
@@ -206,6 +207,12 @@ class HumanoidEnv(VecEnv):
         if not self.aids.harness.any():
             return None
         return harness_wrench(self.state, self.robots, self.aids.harness[self.robots.robot_id].to(self.command.dtype))
+
+    def _set_harness_damping(self) -> None:
+        """Put the harness' share of the damping in force; it changes only when the aids do."""
+        if self.task.aids.harness > 0:
+            scale = self.aids.harness[self.robots.robot_id].to(self.command.dtype)
+            self.pool.set_base_damping(harness_damping(self.robots, scale))
 
     def _derive(self, staged: Tensor, ids: Tensor | None = None) -> PooledState:
         """Turn staging rows into the pooled state, with the command, phase and actions now in force."""
@@ -355,7 +362,8 @@ class HumanoidEnv(VecEnv):
         if self.common_step_counter % LOG_INTERVAL:
             return {}
         entry, falls_per_step, contact_match = self._log.flush()
-        self.aids.update(falls_per_step * self.max_episode_length, contact_match)
+        self.aids.update(episode_ratio(falls_per_step, self.max_episode_length), contact_match)
+        self._set_harness_damping()
         k = torch.tensor(self.penalty_scale)
         return entry | self.commands.log() | self.aids.log(self.robot_names) | {"Curriculum/penalty_scale": k}
 
@@ -391,4 +399,5 @@ class HumanoidEnv(VecEnv):
         self.pool.load_state_dict(state["pool"])
         self.commands.load_state_dict(state["commands"])
         self.aids.load_state_dict(state["aids"])
+        self._set_harness_damping()
         self._log.load_state_dict(state["log"])

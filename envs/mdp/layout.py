@@ -204,18 +204,10 @@ class ObservationLayout:
         }
 
 
-@lru_cache(maxsize=32)
-def cached_layout(cfg: ObservationsCfg, embodiment_dim: int) -> ObservationLayout:
-    """The layout of a configuration, built once; o_ea of any size, without a mirror of its own."""
-    return ObservationLayout(cfg, embodiment_dim, Mirror.keep(*(1.0,) * embodiment_dim))
-
-
 @lru_cache(maxsize=64)
-def scale_vector(
-    cfg: ObservationsCfg, group: str, embodiment_dim: int, dtype: torch.dtype, device: torch.device
-) -> Tensor:
-    """Factor of each column of a group as a tensor, shape (columns,), built once."""
-    return torch.tensor(cached_layout(cfg, embodiment_dim).scale(group), dtype=dtype, device=device)
+def scale_vector(cfg: ObservationsCfg, group: str, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Factor of each column of a group but those of o_ea, which comes standardised, shape (columns,); built once."""
+    return torch.tensor(ObservationLayout(cfg, 0).scale(group), dtype=dtype, device=device)
 
 
 SENSED_SIZE = 3 + 3 + 2 * NUM_SLOTS
