@@ -7,6 +7,7 @@ wherever it stopped, also inside a stage.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import multiprocessing
 import time
@@ -17,6 +18,7 @@ import torch
 from rich.console import Console
 
 from eagle_rl.config.schema import EvaluationCfg, ExperimentCfg
+from eagle_rl.errors import EagleError
 from eagle_rl.evaluation.evaluate import EvaluationResult, evaluate
 from eagle_rl.evaluation.report import pooled_score
 from eagle_rl.runners.checkpoint import load_actor, load_checkpoint, read_manifest
@@ -80,7 +82,7 @@ def run_experiment(
     open_plan(run_dir, provenance, plan_stages(cfg), resume=resume, allow_drift=allow_drift)
     worker = Worker(cfg, run_dir, make_env, provenance, allow_drift)
     spawn = multiprocessing.get_context("spawn")
-    helpers = [spawn.Process(target=worker.work) for _ in range(jobs - 1)]
+    helpers = [spawn.Process(target=_help, args=(worker,)) for _ in range(jobs - 1)]
     for helper in helpers:
         helper.start()
     try:
@@ -93,6 +95,12 @@ def run_experiment(
         for helper in helpers:
             helper.join()
     return worker.result()
+
+
+def _help(worker: Worker) -> None:
+    """Work in a process of its own; what goes wrong is found, and told, by the main process too."""
+    with contextlib.suppress(EagleError, KeyboardInterrupt):
+        worker.work()
 
 
 class Worker:

@@ -27,7 +27,7 @@ class Job:
     """A stage with everything resolved that its training needs."""
 
     cfg: ExperimentCfg
-    """The experiment with this stage's robots, task and seed."""
+    """The experiment with this stage's robots and task."""
     stage: Stage
     folder: Path
     """Where checkpoints and logs go."""
@@ -43,9 +43,9 @@ class Job:
 
 
 def stage_cfg(cfg: ExperimentCfg, stage: Stage) -> ExperimentCfg:
-    """The experiment as one stage sees it: its robots, its task, its seed."""
+    """The experiment as one stage sees it: its robots and its task."""
     task = warm_task(cfg.task) if stage.warm else cfg.task
-    return dataclasses.replace(cfg, robots=stage.robots, task=task, seed=stage.seed)
+    return dataclasses.replace(cfg, robots=stage.robots, task=task)
 
 
 def train(job: Job) -> Path:
