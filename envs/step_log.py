@@ -11,8 +11,10 @@ ERROR_NAMES = ("E_vx", "E_vy", "E_omega", "E_h", "E_p")
 
 
 def episode_ratio(falls_per_step: Tensor, max_episode_length: int) -> Tensor:
-    """Mean episode length over the full length at a constant rate of falls, ``(1 - exp(-x)) / x``; unlike the mean of
-    finished episodes it does not wait for the long ones to finish. Shapes (R,)."""
+    """Mean episode length over the full length at a constant rate of falls, ``(1 - exp(-x)) / x``, shape (R,).
+
+    Unlike the mean of finished episodes it does not wait for the long ones to finish.
+    """
     falls = (falls_per_step * max_episode_length).clamp(min=1e-6)
     return -torch.expm1(-falls) / falls
 
@@ -55,7 +57,7 @@ class StepLog:
         ).double()
         if self._sums is None:
             self._sums = rows.new_zeros(len(self._names), rows.shape[1])
-        self._sums.index_add_(0, self._robot_id, rows)
+        self._sums = self._sums.index_add(0, self._robot_id, rows)
         self._steps += 1
 
     def flush(self) -> tuple[dict[str, Tensor], Tensor, Tensor]:
@@ -90,4 +92,6 @@ class StepLog:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`state_dict` returned."""
-        self._sums, self._steps, self._columns = state["sums"], state["steps"], list(state["columns"])
+        sums: Tensor | None = state["sums"]
+        self._sums = None if sums is None else sums.to(self._robot_id.device)
+        self._steps, self._columns = state["steps"], list(state["columns"])
