@@ -83,6 +83,13 @@ def save_checkpoint(
     return path
 
 
+def mark_stage_end(path: Path) -> Path:
+    """Mark a checkpoint that exists as the last of its stage; only its manifest is replaced."""
+    manifest = verify_checkpoint(path) | {"stage_end": True}
+    write_atomically(path.with_suffix(".json"), _encode_manifest(manifest))
+    return path
+
+
 def load_checkpoint(path: Path, slot_table_hash: str | None = None, device: str | torch.device = "cpu") -> Checkpoint:
     """Read a checkpoint whole and return it only if everything about it is sound.
 
@@ -162,13 +169,15 @@ def best_checkpoint(folder: Path) -> Path | None:
 
 
 def prune_checkpoints(folder: Path, keep: int) -> None:
-    """Delete all but the last ``keep``, the best, and the ends of stages."""
+    """Delete all but the last ``keep``, the best, and the ends of stages; and what an interrupted save left behind."""
     manifests = _manifests(folder)
     last = sorted(manifests, key=iteration_of)[-keep:]
     for path in set(manifests) - {*last, best_checkpoint(folder)}:
         if not manifests[path]["stage_end"]:
             path.with_suffix(".json").unlink(missing_ok=True)
             path.unlink(missing_ok=True)
+    for leftover in folder.glob(".model_*.tmp"):
+        leftover.unlink(missing_ok=True)
 
 
 def iteration_of(path: Path) -> int:
