@@ -10,6 +10,13 @@ from torch import Tensor
 ERROR_NAMES = ("E_vx", "E_vy", "E_omega", "E_h", "E_p")
 
 
+def episode_ratio(falls_per_step: Tensor, max_episode_length: int) -> Tensor:
+    """Mean episode length over the full length at a constant rate of falls, ``(1 - exp(-x)) / x``; unlike the mean of
+    finished episodes it does not wait for the long ones to finish. Shapes (R,)."""
+    falls = (falls_per_step * max_episode_length).clamp(min=1e-6)
+    return -torch.expm1(-falls) / falls
+
+
 class StepLog:
     """Sums over the steps of an interval, one row per robot."""
 

@@ -63,6 +63,8 @@ class ControlCfg:
     """The same bound for hip pitch, knee and ankle pitch, which must travel far to squat [-] (ours)."""
     hip_yaw_ratio: float = 0.5
     """Extra factor at hip yaw [-] (ours, from the single-robot study)."""
+    upper_ratio: float = 0.5
+    """Extra factor at waist, head and arms [-] (ours: the noise of a stiff waist turns the pelvis)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -247,6 +249,7 @@ class TerminationsCfg:
     """When an episode ends (HugWBC 9)."""
 
     episode_length_s: float = 20.0
+    """Time limit [s]."""
     max_roll: float = 0.8
     """[rad]"""
     max_pitch: float = 1.0
@@ -310,10 +313,13 @@ class AidsCfg:
     gait_shaping: float = 1.0
     """Start scale s of the softened contact kernel, kappa = 50 + 1e4 s, weights x (1 + 2 s); 0 is off."""
     gait_shaping_decay: float = 0.02
+    """Relative decay of gait shaping per ``interval_steps`` while contacts match the clock."""
     interval_steps: int = 24
     """Control steps between updates of both scales."""
     min_episode_ratio: float = 0.6
     """The harness decays while the mean episode lasts this share of its full length."""
+    harness_contact_match: float = 0.7
+    """... and while foot contacts match the clock this often: dropped earlier, robots stand and never step (measured)."""
     min_contact_match: float = 0.8
     """Gait shaping decays while foot contacts match the clock this often."""
 

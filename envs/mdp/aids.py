@@ -15,23 +15,25 @@ from eagle_rl.config.schema import AidsCfg
 from ..geometry import rotate_yaw, yaw_of
 from ..state import PooledRobots, PooledState
 
+_SMOOTHING = 0.05
+"""Share of the newest interval in the running means that decide about decay [-]; few environments make it noisy."""
 _SNAP = 0.01
 """Scale under which an aid is off [-]."""
 _GRAVITY = 9.81
 
-# The harness, per kilogram of robot; the first is 200 N m/rad for a robot of 33 kg.
-_TILT_STIFFNESS = 200.0 / 33.0
+# The harness, per kilogram of robot; a robot topples with about m g h = 7 N m/rad/kg.
+_TILT_STIFFNESS = 400.0 / 33.0
 """[N m/rad/kg]"""
-_TILT_DAMPING = 2.5 / 33.0
-"""[N m s/rad/kg]; explicit over a control step of 0.02 s, so it must stay below I / dt: a pelvis held by the damping of
-its joints acts like 0.1 kg m^2, which allows 5 N m s/rad at 33 kg."""
-_MAX_TILT_TORQUE = 60.0 / 33.0
+_MAX_TILT_TORQUE = 120.0 / 33.0
 """[N m/kg]"""
-_MAX_DAMPING_TORQUE = 10.0 / 33.0
-"""[N m/kg]"""
-_HEIGHT_STIFFNESS = 50.0
-"""[N/m/kg]: full support 0.1 m below the commanded height."""
-_MAX_SUPPORT = 0.5
+_TILT_DAMPING = 12.0 / 33.0
+"""[N m s/rad/kg]; part of the physics step and so implicit: as a torque held over a control step it would shake a light
+pelvis apart."""
+_SUPPORT = 0.35
+"""Share of the weight the harness carries at the commanded height [-]; it makes lifting a foot affordable."""
+_HEIGHT_STIFFNESS = 30.0
+"""Change of the support below and above that height [N/m/kg]."""
+_MAX_SUPPORT = 0.6
 """Share of the weight the harness carries at most [-]."""
 _DRAG = 1.0
 """[N s/m/kg]"""
@@ -42,6 +44,8 @@ _MAX_DRAG = 0.15
 class LearningAids:
     """Scales of both aids, one per robot."""
 
+    _STATE = ("harness", "gait_shaping", "_episode_ratio", "_contact_match")
+
     def __init__(self, cfg: AidsCfg, num_robots: int, device: torch.device | str = "cpu") -> None:
         """Start both aids at their configured scales."""
         self.cfg = cfg
@@ -49,6 +53,8 @@ class LearningAids:
         """Scale of the harness, shape (R,)."""
         self.gait_shaping = torch.full((num_robots,), cfg.gait_shaping, dtype=torch.float64, device=device)
         """Scale s of gait shaping, shape (R,)."""
+        self._episode_ratio = torch.zeros_like(self.harness)
+        self._contact_match = torch.zeros_like(self.harness)
 
     def update(self, episode_ratio: Tensor, contact_match: Tensor) -> None:
         """Decay what is no longer needed; call once per ``interval_steps``.
@@ -58,17 +64,22 @@ class LearningAids:
             contact_match: share of steps in which its feet agree with the clock, shape (R,).
         """
         cfg = self.cfg
-        self.harness = _decayed(self.harness, episode_ratio >= cfg.min_episode_ratio, cfg.harness_decay)
-        self.gait_shaping = _decayed(self.gait_shaping, contact_match >= cfg.min_contact_match, cfg.gait_shaping_decay)
+        self._episode_ratio = torch.lerp(self._episode_ratio, episode_ratio.to(self._episode_ratio), _SMOOTHING)
+        self._contact_match = torch.lerp(self._contact_match, contact_match.to(self._contact_match), _SMOOTHING)
+        stands = self._episode_ratio >= cfg.min_episode_ratio
+        steps = self._contact_match >= cfg.harness_contact_match
+        walks = self._contact_match >= cfg.min_contact_match
+        self.harness = _decayed(self.harness, stands & steps, cfg.harness_decay)
+        self.gait_shaping = _decayed(self.gait_shaping, walks & (self.harness == 0.0), cfg.gait_shaping_decay)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Both scales."""
-        return {"harness": self.harness.clone(), "gait_shaping": self.gait_shaping.clone()}
+        """Both scales and the running means that decide about their decay."""
+        return {name: getattr(self, name).clone() for name in self._STATE}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Restore what :meth:`state_dict` returned."""
-        self.harness = state["harness"].to(self.harness)
-        self.gait_shaping = state["gait_shaping"].to(self.gait_shaping)
+        for name in self._STATE:
+            setattr(self, name, state[name].to(self.harness))
 
     def log(self, robot_names: Sequence[str]) -> dict[str, float]:
         """Both scales of every robot."""
@@ -93,9 +104,7 @@ def _bounded(x: Tensor, bound: Tensor) -> Tensor:
 def _tilt_torque(state: PooledState, mass: Tensor) -> Tensor:
     """Torque toward zero roll and the commanded pitch in the yaw frame [N m], shape (N, 2)."""
     error = torch.stack((state.base_roll, state.base_pitch - state.command[:, 4]), dim=1)
-    spring = _bounded(-_TILT_STIFFNESS * mass * error, _MAX_TILT_TORQUE * mass)
-    damping = _bounded(-_TILT_DAMPING * mass * state.base_ang_vel_b[:, :2], _MAX_DAMPING_TORQUE * mass)
-    return spring + damping
+    return _bounded(-_TILT_STIFFNESS * mass * error, _MAX_TILT_TORQUE * mass)
 
 
 def _force(state: PooledState, robots: PooledRobots, mass: Tensor) -> Tensor:
@@ -103,7 +112,8 @@ def _force(state: PooledState, robots: PooledRobots, mass: Tensor) -> Tensor:
     drag = _DRAG * mass * (state.command[:, :2] - state.base_lin_vel_b[:, :2])
     drag = _bounded(drag, _MAX_DRAG * _GRAVITY * mass)
     sag = (robots.nominal_height + state.command[:, 3] - state.base_height).unsqueeze(1)
-    support = torch.minimum(_HEIGHT_STIFFNESS * mass * sag, _MAX_SUPPORT * _GRAVITY * mass).clamp(min=0.0)
+    support = _SUPPORT * _GRAVITY * mass + _HEIGHT_STIFFNESS * mass * sag
+    support = torch.minimum(support, _MAX_SUPPORT * _GRAVITY * mass).clamp(min=0.0)
     return torch.cat((drag, support), dim=1)
 
 
@@ -125,3 +135,8 @@ def harness_wrench(state: PooledState, robots: PooledRobots, scale: Tensor) -> T
     wrench = rotate_yaw(yaw, torch.stack((_force(state, robots, mass), torque), dim=1)).flatten(1)
     scale = scale.to(wrench.dtype).unsqueeze(1)
     return torch.where(scale > 0.0, wrench * scale, 0.0)
+
+
+def harness_damping(robots: PooledRobots, scale: Tensor) -> Tensor:
+    """Damping of the bases' rotation by the harness [N m s/rad], shape (N,)."""
+    return _TILT_DAMPING * robots.total_mass * scale

@@ -6,6 +6,8 @@ good tracking opens the bins around its own. Nothing is ever closed again.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -18,24 +20,27 @@ from ..state import PooledRobots
 _STREAM = "commands"
 
 
+def _corner(ranges: Sequence[Range], side: int, device: torch.device) -> Tensor:
+    """Lower (side 0) or upper (side 1) ends of some ranges."""
+    return torch.tensor([r[side] for r in ranges], dtype=torch.float64, device=device)
+
+
 class CommandGrid:
     """Bins over the finishing ranges of v_x and omega, v_x outer."""
 
-    def __init__(self, cfg: CommandsCfg) -> None:
+    def __init__(self, cfg: CommandsCfg, device: torch.device) -> None:
         """Lay out the bins and find those of the initial box."""
         curriculum = cfg.curriculum
         ranges = (cfg.lin_vel_x, cfg.ang_vel_z)
         counts = (curriculum.num_bins_lin_vel_x, curriculum.num_bins_ang_vel_z)
-        widths = [(r.finishing[1] - r.finishing[0]) / n for r, n in zip(ranges, counts, strict=True)]
-        edges = [
-            r.finishing[0] + w * torch.arange(n, dtype=torch.float64)
-            for r, w, n in zip(ranges, widths, counts, strict=True)
-        ]
-        self.lower = torch.cartesian_prod(*edges)
-        """Lower corner of each bin, (v_x [m/s], omega [rad/s]), shape (B, 2)."""
-        self.width = torch.tensor(widths, dtype=torch.float64)
+        first, last = (_corner([r.finishing for r in ranges], side, device) for side in (0, 1))
+        index = torch.cartesian_prod(*(torch.arange(n, device=device) for n in counts))
+        self.width = (last - first) / index.new_tensor(counts)
+        """Size of a bin, (v_x [m/s], omega [rad/s]), shape (2,)."""
+        self.lower = first + index * self.width
+        """Lower corner of each bin, shape (B, 2)."""
         centre = self.lower + 0.5 * self.width
-        low, high = (torch.tensor([r.initial[side] for r in ranges], dtype=torch.float64) for side in (0, 1))
+        low, high = (_corner([r.initial for r in ranges], side, device) for side in (0, 1))
         self.initial = ((centre >= low) & (centre <= high)).all(dim=1).to(torch.float64)
         """1 for the bins that are open at the start, shape (B,)."""
         distance = (centre.unsqueeze(1) - centre.unsqueeze(0)).abs()
@@ -71,11 +76,9 @@ class CommandSampler:
         self.cfg = cfg
         self.robot_id = robots.robot_id
         self._rng = rng
-        self._grid = CommandGrid(cfg)
+        self._grid = CommandGrid(cfg, robots.robot_id.device)
         self._window_steps = max(1, round(cfg.resampling_time_s / step_dt))
         device, num_envs = robots.robot_id.device, robots.robot_id.shape[0]
-        for name in ("lower", "width", "initial", "neighbours"):
-            setattr(self._grid, name, getattr(self._grid, name).to(device))
         start = self._grid.initial if cfg.curriculum.enabled else torch.ones_like(self._grid.initial)
         self.weights = start.repeat(num_robots, 1)
         """Weight of each robot's bins, float64, shape (R, B)."""

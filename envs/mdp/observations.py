@@ -13,10 +13,9 @@ from eagle_rl.config.schema import ObservationsCfg, Range
 from ..geometry import rotate_yaw, yaw_of
 from ..state import PooledRobots, PooledState
 from .gait import clock
-from .layout import EMBODIMENT_DIM, REFERENCE_MASS, SENSED_SIZE, ObservationLayout, scale_vector, scan_points
+from .layout import REFERENCE_MASS, SENSED_SIZE, ObservationLayout, scale_vector, scan_points
 
 __all__ = [
-    "EMBODIMENT_DIM",
     "History",
     "ObservationLayout",
     "command_observation",
@@ -32,10 +31,10 @@ COLLISION_FORCE = 2.0
 """Contact force above which a link counts as in collision [N] (HugWBC 5)."""
 
 
-def _scaled(columns: list[Tensor], cfg: ObservationsCfg, group: str, embodiment_dim: int = 0) -> Tensor:
+def _scaled(columns: list[Tensor], cfg: ObservationsCfg, group: str) -> Tensor:
     """Lay columns side by side, scale and bound them."""
     x = torch.cat(columns, dim=1)
-    scale = scale_vector(cfg, group, embodiment_dim, x.dtype, x.device)
+    scale = scale_vector(cfg, group, x.dtype, x.device)
     return x.mul_(scale[: x.shape[1]]).clamp_(-cfg.clip, cfg.clip)
 
 
@@ -67,7 +66,7 @@ def noise_scale(cfg: ObservationsCfg, robots: PooledRobots) -> Tensor:
     if cfg.last_action:
         columns.append(torch.zeros_like(mask))
     frame = torch.cat(columns, dim=1) * float(cfg.enable_corruption)
-    return frame * scale_vector(cfg, "history", 0, frame.dtype, frame.device)[: frame.shape[1]]
+    return frame * scale_vector(cfg, "history", frame.dtype, frame.device)[: frame.shape[1]]
 
 
 def delay(current: Tensor, previous: Tensor, fraction: Tensor) -> Tensor:
@@ -152,13 +151,10 @@ def critic_observation(
     """
     columns = _frame_columns(state, robots, cfg)
     columns += [state.command, clock(state.foot_phase), *_privileged_columns(state, robots, friction_range)]
-    if embodiment is None:
-        return _scaled(columns, cfg, "critic")
-    return _scaled([*columns, embodiment], cfg, "critic", embodiment.shape[1])
+    return _scaled(columns if embodiment is None else [*columns, embodiment], cfg, "critic")
 
 
 def estimation_target(state: PooledState, embodiment: Tensor | None, cfg: ObservationsCfg) -> Tensor:
     """What the actor's estimator is to recover: scaled base velocity and o_ea, shape (N, 3 + E)."""
-    if embodiment is None:
-        return _scaled([state.base_lin_vel_b], cfg, "estimate")
-    return _scaled([state.base_lin_vel_b, embodiment], cfg, "estimate", embodiment.shape[1])
+    columns = [state.base_lin_vel_b]
+    return _scaled(columns if embodiment is None else [*columns, embodiment], cfg, "estimate")

@@ -77,6 +77,10 @@ class RobotBatch:
         """Hold a world-frame force [N] and torque [N m] on every base until the next call, shape (n, 6)."""
         self._xfrc[:, self._base] = wrench
 
+    def set_base_damping(self, damping: Array) -> None:
+        """Set the damping of every base's rotation [N m s/rad], shape (n,)."""
+        self._batch.expand("dof_damping")[:, 3:6] = damping[:, None]
+
     def push(self, ids: Ids, lin_vel_w: Array, ang_vel_b: Array) -> None:
         """Add velocity to some bases [m/s, rad/s], shape (m, 3) each."""
         self.qvel[ids, 0:3] += lin_vel_w

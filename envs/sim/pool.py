@@ -99,6 +99,12 @@ class PhysicsPool:
         for robot, local, at in self.split(ids):
             self.batches[robot].push(local, linear[at], angular[at])
 
+    def set_base_damping(self, damping: Tensor) -> None:
+        """Set the damping of every base's rotation [N m s/rad], shape (N,)."""
+        values = damping.to("cpu", torch.float64).numpy()
+        for batch, rows in zip(self.batches, self.rows, strict=True):
+            batch.set_base_damping(values[rows])
+
     def faults(self) -> Tensor:
         """Environments whose physics went wrong since their reset, bool, shape (N,)."""
         return torch.from_numpy(np.concatenate([batch.faults() for batch in self.batches])).to(self.device)
