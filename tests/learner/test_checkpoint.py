@@ -182,8 +182,13 @@ from eagle_rl.runners import checkpoint as ckpt
 from eagle_rl.runners.provenance import Provenance
 torch.set_num_threads(1)
 warnings.simplefilter("ignore")
-folder, rng, newest = Path(sys.argv[1]), random.Random(0), 0
-state = {"weights": torch.arange(200_000.0)}
+folder, rng, newest = Path(sys.argv[1]), random.Random(0), 1
+state = {"weights": torch.arange(50_000.0)}
+ckpt.save_checkpoint(folder, state, Provenance(), iteration=1, env_steps=0)  # the first is slow: it asks for versions
+start = time.monotonic()
+for _ in range(5):
+    ckpt.save_checkpoint(folder, state, Provenance(), iteration=1, env_steps=0)
+duration = (time.monotonic() - start) / 5
 for _ in range(50):
     child = os.fork()
     if child == 0:
@@ -191,15 +196,13 @@ for _ in range(50):
             newest += 1
             ckpt.save_checkpoint(folder, state, Provenance(), iteration=newest, env_steps=0)
             ckpt.prune_checkpoints(folder, 2)
-    time.sleep(rng.uniform(0.005, 0.06))
+    time.sleep(rng.uniform(0, 3) * duration)
     os.kill(child, signal.SIGKILL)
     os.waitpid(child, 0)
-    path = ckpt.latest_checkpoint(folder)
-    if path is not None:
-        loaded = ckpt.load_checkpoint(path)
-        assert torch.equal(loaded.state["weights"], state["weights"])
-        assert ckpt.iteration_of(path) >= newest, (path, newest)
-        newest = ckpt.iteration_of(path)
+    loaded = ckpt.load_checkpoint(ckpt.latest_checkpoint(folder))
+    assert torch.equal(loaded.state["weights"], state["weights"])
+    assert loaded.manifest["iteration"] >= newest, (loaded.path, newest)
+    newest = loaded.manifest["iteration"]
 print(newest)
 """
 
@@ -209,7 +212,7 @@ def test_a_save_loop_killed_at_50_random_moments_never_loses_a_checkpoint(tmp_pa
         [sys.executable, "-c", SAVER, str(tmp_path)], cwd=ROOT, capture_output=True, text=True, timeout=120, check=False
     )
     assert done.returncode == 0, done.stderr
-    assert int(done.stdout) > 20, "the children were killed before they saved anything"
+    assert int(done.stdout) > 5, "the children were killed before they saved anything"
 
 
 def test_a_policy_is_loaded_without_an_environment(tmp_path):
