@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 
 from eagle_rl.algorithms.running_means import RunningMeans
-from eagle_rl.runners.checkpoint import write_atomically
 from eagle_rl.runners.event_file import EventFile
+from eagle_rl.runners.files import write_atomically
 
 EPISODES = 100
 """Finished episodes of each robot over which rewards and lengths are averaged."""

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 import pickle
 import random
 import subprocess
@@ -14,6 +15,7 @@ import torch
 
 from eagle_rl.errors import CheckpointError
 from eagle_rl.runners import checkpoint as ckpt
+from eagle_rl.runners.files import write_atomically
 from eagle_rl.runners.provenance import Provenance, slot_table_hash
 from envs.robots.slots import SLOT_NAMES
 from tests.learner.helpers import make_runner
@@ -162,14 +164,14 @@ def test_pruning_keeps_the_last_the_best_and_the_ends_of_stages(tmp_path):
 
 def test_a_failed_write_leaves_the_old_file_whole(tmp_path, monkeypatch):
     path = tmp_path / "file"
-    ckpt.write_atomically(path, b"old")
+    write_atomically(path, b"old")
 
     def full_disk(descriptor):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(ckpt.os, "fsync", full_disk)
+    monkeypatch.setattr(os, "fsync", full_disk)
     with pytest.raises(OSError, match="No space left"):
-        ckpt.write_atomically(path, b"new")
+        write_atomically(path, b"new")
     assert path.read_bytes() == b"old"
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
 
@@ -179,6 +181,7 @@ import os, random, signal, sys, time, warnings
 from pathlib import Path
 import torch
 from eagle_rl.runners import checkpoint as ckpt
+from eagle_rl.runners.files import write_atomically
 from eagle_rl.runners.provenance import Provenance
 torch.set_num_threads(1)
 warnings.simplefilter("ignore")
@@ -224,6 +227,40 @@ def test_a_policy_is_loaded_without_an_environment(tmp_path):
         assert torch.equal(actor(obs), runner.alg.actor(obs))
     assert manifest["config"] == {"name": "toy"}
     assert not actor.training
+
+
+def test_a_published_policy_is_the_checkpoint_s_and_any_flipped_byte_is_refused(tmp_path):
+    runner = make_runner(tmp_path, provenance=PROVENANCE)
+    checkpoint = runner.learn(1)
+    path = ckpt.publish_policy(checkpoint, tmp_path / "weights" / "toy")
+    actor, manifest = ckpt.load_actor(path, slot_table_hash=PROVENANCE.slot_table_hash)
+    obs = runner.env.get_observations()
+    with torch.no_grad():
+        assert torch.equal(actor(obs), runner.alg.actor(obs))
+    assert manifest == ckpt.read_manifest(checkpoint)
+    with pytest.raises(CheckpointError, match="another slot table"):
+        ckpt.load_actor(path, slot_table_hash="other")
+    whole, rng = path.read_bytes(), random.Random(1)
+    header = len(whole) - sum(x.numel() * 4 for x in actor.state_dict().values())
+    for position in [rng.randrange(header - 8) for _ in range(60)] + [
+        rng.randrange(header, len(whole)) for _ in range(60)
+    ]:
+        data = bytearray(whole)
+        data[position] ^= 1 << rng.randrange(8)
+        path.write_bytes(data)
+        with pytest.raises(CheckpointError, match=r"toy\.safetensors: (damaged|not a published policy)"):
+            ckpt.load_actor(path)
+
+
+@pytest.mark.parametrize("hidden", [[10**9], [-1, -5], "many", [[1]]])
+def test_an_absurd_architecture_is_refused_without_claiming_memory(tmp_path, hidden):
+    runner = make_runner(tmp_path)
+    state = runner._state()
+    architecture = json.loads(json.dumps(state["architecture"]))
+    architecture["networks"]["hidden_dims"] = hidden
+    path = ckpt.save_checkpoint(tmp_path, state | {"architecture": architecture}, PROVENANCE, iteration=1, env_steps=0)
+    with pytest.raises(CheckpointError, match="does not hold a policy"):
+        ckpt.load_actor(path)
 
 
 def test_a_checkpoint_without_a_policy_is_refused_in_words(tmp_path):
