@@ -36,6 +36,14 @@ OWNERS = {
 """Packages that only some folders or files may import."""
 
 
+NAMES_AS_DATA = {
+    "eagle_rl/config/schema.py",  # which robots an experiment has if it names none
+    "eagle_rl/evaluation/reference.py",  # the paper's own numbers, robot by robot
+    "envs/robots/embodiment.py",  # the bodies that o_ea is standardised over
+}
+"""Files that list robots without treating any of them in a way of its own."""
+
+
 def imports(file: str) -> set[str]:
     """Absolute names of everything a file imports, wherever in it."""
     package = file.removesuffix(".py").split("/")[:-1]
@@ -83,7 +91,7 @@ def test_no_code_knows_a_robot_by_name():
     found = [
         f"{file}:{node.lineno}: {node.value!r}"
         for file, tree in SOURCES.items()
-        if file != "eagle_rl/config/schema.py"
+        if file not in NAMES_AS_DATA
         for node in ast.walk(tree)
         if isinstance(node, ast.Constant) and node.value in robots
     ]
