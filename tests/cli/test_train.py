@@ -50,7 +50,8 @@ def test_a_run_directory_explains_itself(runs, capsys):
     assert str(run_dir) in capsys.readouterr().out
 
 
-def test_start_up_prints_the_whole_task(runs, capsys):
+def test_start_up_prints_the_whole_task(runs, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
     assert train("smoke") == 0
     out = capsys.readouterr().out
     for part in ("lin_vel_x", "base_orientation", "projected_gravity", "sensing_latency_s", "max_pitch", "harness"):
