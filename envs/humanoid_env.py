@@ -191,6 +191,7 @@ class HumanoidEnv(VecEnv):
         self._pinned = command
         if command is not None:
             self._set_commands(self._all, command.to(self.command))
+            self._show_commands()
 
     @property
     def penalty_scale(self) -> float:
@@ -329,8 +330,12 @@ class HumanoidEnv(VecEnv):
         ids = ((self.episode_length_buf % interval == 0) & (self.episode_length_buf > 0)).nonzero().squeeze(1)
         if len(ids):
             self._draw_commands(ids)
-            self.state.command, self.state.standing = self.command, self.standing
-            self.state.foot_phase = foot_phases(self.phase, self.standing, self.task.gait)
+            self._show_commands()
+
+    def _show_commands(self) -> None:
+        """Let the present state, and so the next observation, show the commands now in force."""
+        self.state.command, self.state.standing = self.command, self.standing
+        self.state.foot_phase = foot_phases(self.phase, self.standing, self.task.gait)
 
     def _draw_commands(self, ids: Tensor) -> None:
         if self._pinned is not None:
