@@ -44,7 +44,7 @@ def test_a_run_directory_explains_itself(runs, capsys):
     record = json.loads((run_dir / "provenance.json").read_text())
     assert record["seed"] == 7
     assert record["versions"]["mujoco"]
-    assert set(record["robots"]) == set(cfg.robots)
+    assert set(record["robot_hashes"]) == set(cfg.robots)
     readme = (run_dir / "README.txt").read_text()
     assert f"eagle train --resume {run_dir}" in readme
     assert str(run_dir) in capsys.readouterr().out

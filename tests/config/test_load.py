@@ -11,8 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from eagle_rl.config.compose import known_names
-from eagle_rl.config.load import config_hash, differences, load_experiment, to_yaml
+from eagle_rl.config.load import load_experiment, to_yaml
 from eagle_rl.config.schema import ExperimentCfg, RewardWeightsCfg
+from eagle_rl.config.validate import leaves
 from eagle_rl.errors import ConfigError, RobotError
 
 EXPERIMENTS = known_names("experiment")
@@ -42,7 +43,6 @@ def test_a_resolved_experiment_reads_back_as_itself(name):
     cfg = load_experiment(name)
     again = load_experiment(write(to_yaml(cfg)))
     assert again == cfg
-    assert config_hash(again) == config_hash(cfg)
 
 
 def test_a_whole_configuration_is_written_down_in_the_resolved_file():
@@ -58,8 +58,9 @@ def test_the_papers_task_is_the_printed_table_without_aids():
 
 
 def test_without_embodiment_observation_differs_from_ppo_in_that_alone():
-    changes = differences(load_experiment("ppo"), load_experiment("ppo_no_eo"))
-    assert [c.split(":")[0] for c in changes] == ["name", "description", "task.observations.embodiment_observation"]
+    ppo, without = (dict(leaves(load_experiment(name))) for name in ("ppo", "ppo_no_eo"))
+    changed = {key for key in ppo if ppo[key] != without[key]}
+    assert changed == {"name", "description", "task.observations.embodiment_observation"}
 
 
 def test_scale_paper_has_4096_environments_and_hugwbcs_ppo():
