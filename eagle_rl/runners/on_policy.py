@@ -331,7 +331,7 @@ class EagleRunner(OnPolicyRunner):
         }
         on_gpu = str(self.device).startswith("cuda")
         if on_gpu:
-            torch.cuda.set_device(self.device)
+            torch.cuda.set_device(torch.device(self.device).index or 0)
         if not torch.distributed.is_initialized():
             own_gpu = on_gpu and torch.cuda.device_count() >= int(os.getenv("LOCAL_WORLD_SIZE", "1"))
             torch.distributed.init_process_group("nccl" if own_gpu else "gloo")
