@@ -151,8 +151,8 @@ class HumanoidEnv(VecEnv):
         self._last_last_actions, self._last_actions = self._last_actions, self._actions
         self._actions = actions.to(self._actions.dtype).clamp(-clip, clip) * self.robots.slot_mask
         self.randomizer.push(self.step_count, self.penalty_scale, self.step_dt)
-        targets = self.robots.default_joint_pos + self.robots.action_scale * self._actions + self.randomizer.motor_offset
-        staged = self.pool.step(targets, self._harness())
+        targets = self.robots.default_joint_pos + self.robots.action_scale * self._actions
+        staged = self.pool.step(targets + self.randomizer.motor_offset, self._harness())
         self.common_step_counter += 1
         self.episode_length_buf = self.episode_length_buf + 1
         self.step_count += 1
