@@ -95,10 +95,10 @@ def _require_several(embeddings: Embeddings) -> None:
 
 
 def silhouette(embeddings: Embeddings) -> float:
-    """Silhouette score of the robots' clusters, standardised features: 1 well separated, 0 overlapping, -1 mixed up."""
+    """Silhouette score of the robots' clusters: 1 well separated, 0 overlapping, -1 mixed up."""
     _require_several(embeddings)
-    features = StandardScaler().fit_transform(embeddings.features)
-    return float(silhouette_score(features, embeddings.robot, sample_size=min(5000, len(features)), random_state=0))
+    size = min(5000, len(embeddings.features))
+    return float(silhouette_score(embeddings.features, embeddings.robot, sample_size=size, random_state=0))
 
 
 def probe_accuracy(embeddings: Embeddings) -> float:
@@ -112,6 +112,5 @@ def probe_accuracy(embeddings: Embeddings) -> float:
 
 def tsne(embeddings: Embeddings, seed: int = 0) -> NDArray[np.float32]:
     """A map of the embeddings in the plane, shape (M, 2)."""
-    features = StandardScaler().fit_transform(embeddings.features)
-    perplexity = min(30.0, (len(features) - 1) / 3)
-    return TSNE(perplexity=perplexity, init="pca", random_state=seed).fit_transform(features)
+    perplexity = min(30.0, (len(embeddings.features) - 1) / 3)
+    return TSNE(perplexity=perplexity, init="pca", random_state=seed).fit_transform(embeddings.features)

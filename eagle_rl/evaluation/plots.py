@@ -54,48 +54,41 @@ def learning_curves(panels: Mapping[str, Sequence[Curve]]) -> Figure:
     """One panel per quantity, one line per robot, over environment steps."""
     columns = min(3, len(panels))
     figure, axes = _panels(-(-len(panels) // columns), columns)
-    robots = list(dict.fromkeys(curve.robot for curves in panels.values() for curve in curves))
+    colours = _palette(curve.robot for curves in panels.values() for curve in curves)
     for ax, (title, curves) in zip(axes.flat, panels.items(), strict=False):
-        for curve in curves:
-            ax.plot(
-                np.array(curve.env_steps) / 1e6, curve.values, color=_colour(robots, curve.robot), label=curve.robot
-            )
+        for curve in sorted(curves, key=lambda curve: curve.robot):
+            ax.plot(np.array(curve.env_steps) / 1e6, curve.values, color=colours[curve.robot], label=curve.robot)
         ax.set_title(title, fontsize=10)
         ax.set_xlabel("environment steps [M]", fontsize=9)
     for ax in axes.flat[len(panels) :]:
         ax.set_visible(False)
-    _legend(figure, axes.flat[0], len(robots))
+    _legend(figure, axes.flat[0], len(colours))
     return figure
 
 
-def _colour(names: Sequence[str], name: str) -> str:
-    return COLOURS[list(names).index(name) % len(COLOURS)]
+def _palette(names: Iterable[str]) -> dict[str, str]:
+    """The same colour for the same fleet's robot in every figure."""
+    return {name: COLOURS[i % len(COLOURS)] for i, name in enumerate(sorted(set(names)))}
 
 
 def error_rounds(scores: Sequence[RoundScores]) -> Figure:
     """Errors over rounds (paper, Fig. tracking-error curves): open triangles specialists, filled ones generalists."""
     figure, axes = _panels(1, len(ERRORS), width=2.6)
-    robots = list(dict.fromkeys(score.robot for score in scores))
+    colours = _palette(score.robot for score in scores)
     for d, ax in enumerate(axes.flat):
-        for robot in robots:
+        for robot, colour in colours.items():
             own = sorted((s for s in scores if s.robot == robot), key=lambda s: s.position)
-            points = [(s.position, s.errors[d]) for s in own]
-            ax.plot(*zip(*points, strict=True), color=_colour(robots, robot), linewidth=1, alpha=0.6)
-            for specialist, face, label in ((True, "white", None), (False, _colour(robots, robot), robot)):
-                marked = [(s.position, s.errors[d]) for s in own if s.specialist == specialist]
-                if marked:
-                    ax.plot(
-                        *zip(*marked, strict=True),
-                        "^",
-                        color=_colour(robots, robot),
-                        markerfacecolor=face,
-                        label=label,
-                    )
+            ax.plot([s.position for s in own], [s.errors[d] for s in own], color=colour, linewidth=1.2, label=robot)
+            for score in own:
+                face = "white" if score.specialist else colour
+                ax.plot(score.position, score.errors[d], "^", color=colour, markerfacecolor=face)
         ax.set_title(ERRORS[d], fontsize=10)
         ax.set_xlabel("round", fontsize=9)
         ax.set_ylim(bottom=0)
         ax.xaxis.get_major_locator().set_params(integer=True)
-    _legend(figure, axes.flat[0], len(robots))
+    for label, face in (("specialist", "white"), ("generalist", "black")):
+        axes[0, 0].plot([], [], "^", color="black", markerfacecolor=face, label=label)
+    _legend(figure, axes[0, 0], len(colours) + 2)
     return figure
 
 
@@ -103,9 +96,10 @@ def latent_maps(maps: Mapping[str, tuple[Embeddings, NDArray[np.float32], float,
     """t-SNE maps side by side; each with its silhouette score and linear-probe accuracy in the title."""
     figure, axes = _panels(1, len(maps), width=3.6, height=3.4)
     for ax, (title, (embeddings, points, silhouette, accuracy)) in zip(axes.flat, maps.items(), strict=True):
+        colours = _palette(embeddings.robots)
         for i, robot in enumerate(embeddings.robots):
             own = points[embeddings.robot == i]
-            ax.scatter(own[:, 0], own[:, 1], s=8, color=COLOURS[i % len(COLOURS)], marker=MARKERS[i % 7], label=robot)
+            ax.scatter(own[:, 0], own[:, 1], s=8, color=colours[robot], marker=MARKERS[i % 7], label=robot)
         ax.set_title(f"{title}\nsilhouette {silhouette:.2f}, linear probe {accuracy:.0%}", fontsize=10)
         ax.set_xticks([])
         ax.set_yticks([])
@@ -133,9 +127,9 @@ def robustness(panels: Iterable[tuple[Sweep, Mapping[float, Mapping[str, RobotMe
     sweeps = list(panels)
     figure, axes = _panels(2, len(sweeps))
     for column, (sweep, scores) in zip(axes.T, sweeps, strict=True):
-        robots = list(next(iter(scores.values())))
-        for i, robot in enumerate(robots):
-            style = {"color": COLOURS[i % len(COLOURS)], "marker": MARKERS[i % 7], "markersize": 4, "label": robot}
+        colours = _palette(next(iter(scores.values())))
+        for i, (robot, colour) in enumerate(colours.items()):
+            style = {"color": colour, "marker": MARKERS[i % 7], "markersize": 4, "label": robot}
             column[0].plot(list(scores), [100 * score[robot].survival for score in scores.values()], **style)
             column[1].plot(list(scores), [_relative(score[robot]) for score in scores.values()], **style)
         column[0].set_ylabel("survival [%]", fontsize=9)
