@@ -18,7 +18,7 @@ from .mdp.aids import LearningAids, harness_damping, harness_wrench
 from .mdp.commands import CommandSampler
 from .mdp.curriculum import penalty_scale
 from .mdp.gait import advance_phase, clock, foot_phases
-from .mdp.metrics import contact_match, tracking_errors
+from .mdp.metrics import contact_match, measured_commands, tracking_errors
 from .mdp.observations import (
     History,
     ObservationLayout,
@@ -185,6 +185,10 @@ class HumanoidEnv(VecEnv):
     def tracking_errors(self) -> Tensor:
         """Absolute error of each command at the last step [m/s, m/s, rad/s, m, rad], shape (N, 5)."""
         return tracking_errors(self.state, self.robots)
+
+    def measured_commands(self) -> Tensor:
+        """What each command asks for, as it is now [m/s, m/s, rad/s, m, rad], shape (N, 5)."""
+        return measured_commands(self.state, self.robots)
 
     def pin_commands(self, command: Tensor | None) -> None:
         """Hold these commands, shape (N, 5), instead of sampling; ``None`` returns to sampling at the next draw."""
