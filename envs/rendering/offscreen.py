@@ -1,0 +1,118 @@
+"""Frames without a display: an OpenGL context from EGL or OSMesa, whichever the machine has."""
+
+from __future__ import annotations
+
+import ctypes.util
+import os
+from types import TracebackType
+from typing import Protocol, Self
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from eagle_rl.errors import EagleError
+
+from .scene import Array, CameraCfg, FollowCamera, Stage
+
+Frame = NDArray[np.uint8]
+
+_HELP = (
+    "Pictures need OpenGL without a display, and this machine has neither EGL nor OSMesa that works: install one, "
+    "for example `apt-get install libegl1 libgl1-mesa-dri` (or `libosmesa6`)."
+)
+
+
+class RenderingError(EagleError, RuntimeError):
+    """This machine cannot draw."""
+
+
+class _Context(Protocol):
+    """What MuJoCo's GL contexts have in common."""
+
+    def make_current(self) -> None: ...
+
+    def free(self) -> None: ...
+
+
+def gl_backends() -> tuple[str, ...]:
+    """Backends worth trying: the one ``MUJOCO_GL`` names, otherwise those whose library is installed."""
+    chosen = os.environ.get("MUJOCO_GL", "").lower()
+    if chosen in ("egl", "osmesa"):
+        return (chosen,)
+    libraries = {"egl": "EGL", "osmesa": "OSMesa"}
+    return tuple(backend for backend, library in libraries.items() if ctypes.util.find_library(library))
+
+
+def open_context(width: int, height: int) -> _Context:
+    """An offscreen OpenGL context.
+
+    Raises:
+        RenderingError: no backend works; the message says what to install.
+    """
+    for backend in gl_backends():
+        try:
+            if backend == "egl":
+                from mujoco.egl import GLContext
+            else:
+                from mujoco.osmesa import GLContext
+            return GLContext(width, height)
+        except (ImportError, AttributeError, RuntimeError, OSError):
+            continue
+    raise RenderingError(_HELP)
+
+
+class OffscreenRenderer:
+    """Draws a stage into arrays. Use as a context manager."""
+
+    def __init__(self, stage: Stage, width: int = 1280, height: int = 720, camera: CameraCfg | None = None) -> None:
+        """Open a context for pictures of ``width`` x ``height`` pixels."""
+        self.stage = stage
+        self.width, self.height = width, height
+        fovy = float(stage.model.vis.global_.fovy)
+        self.camera = FollowCamera(camera or CameraCfg(), len(stage.names), width / height, fovy)
+        self._context = open_context(width, height)
+        self._context.make_current()
+        self._scene = mujoco.MjvScene(stage.model, maxgeom=4000)
+        self._option = mujoco.MjvOption()
+        self._gl = mujoco.MjrContext(stage.model, mujoco.mjtFontScale.mjFONTSCALE_150.value)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._gl)
+
+    def __enter__(self) -> Self:
+        """The renderer itself."""
+        return self
+
+    def __exit__(self, *_: type[BaseException] | BaseException | TracebackType | None) -> None:
+        """Close."""
+        self.close()
+
+    def close(self) -> None:
+        """Free the context."""
+        self._gl.free()
+        self._context.free()
+
+    def frame(self) -> Frame:
+        """A picture of the stage as it is posed, RGB, shape (height, width, 3)."""
+        self.camera.follow(self.stage.root_positions())
+        self._context.make_current()
+        mujoco.mjv_updateScene(
+            self.stage.model,
+            self.stage.data,
+            self._option,
+            None,
+            self.camera.camera,
+            mujoco.mjtCatBit.mjCAT_ALL.value,
+            self._scene,
+        )
+        rect = mujoco.MjrRect(0, 0, self.width, self.height)
+        mujoco.mjr_render(rect, self._scene, self._gl)
+        pixels = np.empty((self.height, self.width, 3), np.uint8)
+        mujoco.mjr_readPixels(pixels, None, rect, self._gl)
+        return np.flipud(pixels)
+
+
+def picture(stage: Stage, qpos: list[Array], width: int = 1280, height: int = 720) -> Frame:
+    """One frame of the robots in the given configurations."""
+    with OffscreenRenderer(stage, width, height) as renderer:
+        stage.pose(qpos)
+        return renderer.frame()
