@@ -43,6 +43,12 @@ class CheckpointError(EagleError, ValueError):
     exit_code = 5
 
 
+class Interrupted(KeyboardInterrupt):
+    """A run was asked to stop, finished its iteration and saved; the message says where."""
+
+    exit_code = 130
+
+
 def did_you_mean(got: str, known: Iterable[str]) -> str:
     """Return `` Did you mean X?`` for the known name nearest to ``got``, or an empty string."""
     close = difflib.get_close_matches(got, list(known), n=1, cutoff=0.5)

@@ -67,7 +67,13 @@ class CounterRng:
         return bits.to(torch.float32) * (1.0 / (1 << 24))
 
     def uniform_in(
-        self, low: float | Tensor, high: float | Tensor, stream: str, count: Tensor, size: int, ids: Tensor | None = None
+        self,
+        low: float | Tensor,
+        high: float | Tensor,
+        stream: str,
+        count: Tensor,
+        size: int,
+        ids: Tensor | None = None,
     ) -> Tensor:
         """Numbers uniform in [low, high), shape (n, size)."""
         return low + (high - low) * self.uniform(stream, count, size, ids)

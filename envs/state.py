@@ -7,10 +7,10 @@ link). Per-foot arrays are in the order left, right. Observations, rewards and t
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Self
 
 import torch
 from torch import Tensor
+from typing_extensions import Self
 
 
 @dataclass(kw_only=True)

@@ -405,7 +405,10 @@ class PlanCfg:
     tolerance: float = 0.01
     """Rounds stop when the pooled tracking score improves by less than this share."""
     root: str | None = None
-    """Checkpoint to fork from instead of training a generalist."""
+    """Checkpoint to fork from instead of training a generalist; with method ``ppo`` the generalist's budget is then
+    spent on continuing from it."""
+    judge_envs_per_robot: int = 64
+    """Environments per robot in the evaluation that ends each stage and decides on convergence; 0 leaves it out."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -419,6 +422,9 @@ class EvaluationCfg:
     resampling_time_s: float = 0.0
     """0 keeps commands for the episode; otherwise redraw every so many seconds."""
     randomization: bool = False
+    """Dynamics as randomized in training, pushes included at full strength; off is the nominal robot."""
+    noise: bool = False
+    """Sensor noise as in training."""
     seed: int = 1234
     physics_dt: float = 0.005
     decimation: int = 4

@@ -1,0 +1,1 @@
+"""PPO with the losses of the paper added to it, and the specialists it imitates."""

@@ -1,0 +1,30 @@
+"""How learner and simulation meet: robots by name become one pooled environment."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+from eagle_rl.config.schema import RunCfg, TaskCfg
+
+if TYPE_CHECKING:
+    from rsl_rl.env import VecEnv
+
+MakeEnv = Callable[[Sequence[str], int, TaskCfg, int], "VecEnv"]
+"""``(robots, num_envs, task, seed) -> VecEnv``."""
+
+
+def make_env_factory(run: RunCfg) -> MakeEnv:
+    """The function by which runners build environments without knowing the simulation.
+
+    Args:
+        run: device of the tensors and number of physics threads.
+    """
+    from envs.humanoid_env import HumanoidEnv
+    from envs.robots.load import load_robot
+
+    def make_env(robots: Sequence[str], num_envs: int, task: TaskCfg, seed: int) -> VecEnv:
+        specs = [load_robot(name) for name in robots]
+        return HumanoidEnv(task, specs, num_envs, seed, device=run.device, num_threads=run.num_threads)
+
+    return make_env

@@ -1,0 +1,75 @@
+"""``eagle VERB ...``: find the verb, run it, turn what goes wrong into one message and an exit code.
+
+Verbs are imported only when called, so that ``--help`` and configuration errors need not wait for torch.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+from collections.abc import Callable, Sequence
+
+from eagle_rl._version import __version__
+from eagle_rl.errors import EagleError, did_you_mean
+
+VERBS: dict[str, str] = {
+    "train": "run an experiment into a run directory, or resume one",
+    "play": "show a checkpoint: browser, window or video",
+    "evaluate": "tracking errors and survival of checkpoints: the paper's table",
+    "plot": "figures from runs: curves, latents, rounds",
+    "export": "a checkpoint as ONNX with its input/output contract",
+    "status": "progress of a run and its stages",
+    "robots": "list, show or check robots",
+    "doctor": "check this installation",
+}
+"""Each verb ``v`` is ``eagle_rl.cli.v:main``."""
+
+INTERRUPTED = 130
+
+
+def usage() -> str:
+    """The text of ``eagle --help``."""
+    verbs = "\n".join(f"  {verb:<10} {summary}" for verb, summary in VERBS.items())
+    title = f"eagle {__version__}: one whole-body controller for many humanoids."
+    return f"{title}\n\nusage: eagle VERB ...\n\n{verbs}\n\neagle VERB --help tells more."
+
+
+def guarded(action: Callable[[], int]) -> int:
+    """Run ``action``; report a user's error in words, and return the exit code."""
+    try:
+        return action()
+    except EagleError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except BrokenPipeError:  # the reader, such as head, has left
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+
+
+def run_verb(verb: str, argv: Sequence[str]) -> int:
+    """Run one verb with its arguments and return the exit code; the entry point of ``train.py`` and ``play.py``."""
+    return guarded(lambda: importlib.import_module(f"eagle_rl.cli.{verb}").main(argv))
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point of the ``eagle`` command."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    verb = arguments[0] if arguments else "--help"
+    if verb in VERBS:
+        return run_verb(verb, arguments[1:])
+    if verb in ("-h", "--help", "help"):
+        print(usage())
+        return 0
+    if verb in ("-V", "--version"):
+        print(__version__)
+        return 0
+    print(f"error: no verb {verb!r}.{did_you_mean(verb, VERBS)} Known: {', '.join(VERBS)}.", file=sys.stderr)
+    return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,100 @@
+"""The task in words: every command, observation, reward, randomization and termination, with range, weight and unit."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from eagle_rl.config.docs import field_docs
+from eagle_rl.config.schema import AidsCfg, CommandsCfg, ObservationsCfg, RandomizationCfg, RewardsCfg, TaskCfg
+from eagle_rl.config.validate import CONTROL_STEP
+
+COMMAND_UNITS = {
+    "lin_vel_x": "m/s",
+    "lin_vel_y": "m/s",
+    "ang_vel_z": "rad/s",
+    "base_height": "m",
+    "body_pitch": "rad",
+}
+
+
+def _table(title: str, columns: Iterable[str], rows: Iterable[Iterable[str]]) -> Table:
+    table = Table(title=title, title_justify="left", title_style="bold", box=None, pad_edge=False, header_style="dim")
+    for column in columns:
+        table.add_column(column, overflow="fold")
+    for row in rows:
+        table.add_row(*row)
+    return table
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, tuple):
+        return f"[{', '.join(_text(v) for v in value)}]"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _commands(cfg: CommandsCfg) -> Table:
+    ranges = {name: getattr(cfg, name) for name in COMMAND_UNITS}
+    rows = [(name, _text(r.initial), _text(r.finishing), COMMAND_UNITS[name]) for name, r in ranges.items()]
+    title = f"Commands: drawn every {cfg.resampling_time_s:g} s, standing with probability {cfg.standing_probability:g}"
+    return _table(title, ("command", "initial", "finishing", "unit"), rows)
+
+
+def _observations(cfg: ObservationsCfg) -> Table:
+    from envs.mdp.layout import EMBODIMENT_DIM, ObservationLayout
+
+    layout = ObservationLayout(cfg, EMBODIMENT_DIM if cfg.embodiment_observation else 0)
+    frame = layout.groups["history"][: len(layout.groups["history"]) // cfg.history_length]
+    groups = {f"history x {cfg.history_length}": frame} | {
+        name: layout.groups[name] for name in ("command", "clock", "critic", "estimate")
+    }
+    noise = dataclasses.asdict(cfg.noise) if cfg.enable_corruption else {}
+    rows = [
+        (
+            group if term is terms[0] else "",
+            term.name,
+            str(term.size),
+            _text(term.scale),
+            _text(noise.get(term.name.removesuffix("_rel"), 0.0)) if group.startswith("history") else "0",
+            term.unit,
+        )
+        for group, terms in groups.items()
+        for term in terms
+    ]
+    return _table("Observations", ("group", "term", "size", "scale", "noise ±", "unit"), rows)
+
+
+def _rewards(cfg: RewardsCfg) -> Table:
+    from envs.mdp import rewards
+
+    weights = dataclasses.asdict(cfg.weights)
+    rows = [
+        (name, _text(weight), _text(weight * CONTROL_STEP), (getattr(rewards, name).__doc__ or "").split("\n")[0])
+        for name, weight in weights.items()
+    ]
+    title = f"Rewards: orientation {cfg.orientation}, penalty factor k from {cfg.penalty_initial:g}"
+    return _table(title, ("term", "weight", "per step", "value"), rows)
+
+
+def _documented(title: str, cfg: RandomizationCfg | AidsCfg | Any) -> Table:
+    docs = field_docs(cfg)
+    rows = [(f.name, _text(getattr(cfg, f.name)), docs.get(f.name, "")) for f in dataclasses.fields(cfg)]
+    return _table(title, ("key", "value", "meaning"), rows)
+
+
+def print_mdp(task: TaskCfg, console: Console) -> None:
+    """Print the whole task as tables."""
+    for table in (
+        _commands(task.commands),
+        _observations(task.observations),
+        _rewards(task.rewards),
+        _documented("Terminations", task.terminations),
+        _documented("Randomization" if task.randomization.enabled else "Randomization (off)", task.randomization),
+        _documented("Learning aids", task.aids),
+    ):
+        console.print(table)
+        console.print()

@@ -1,0 +1,118 @@
+"""``eagle train``: an experiment in, a run directory out."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from eagle_rl.config.compose import known_names
+from eagle_rl.config.load import config_hash, load_experiment, to_yaml
+from eagle_rl.config.schema import ExperimentCfg
+from eagle_rl.errors import ConfigError
+
+from .provenance import provenance
+from .run_directory import check_drift, create_run, open_run
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="eagle train",
+        usage="eagle train EXPERIMENT [key=value ...] [options]\n"
+        "       eagle train --resume RUN [key=value ...] [options]",
+        description="Train an experiment into a new run directory, or continue one.",
+        epilog=f"Experiments: {', '.join(known_names('experiment'))}, or the path of a YAML file.",
+    )
+    parser.add_argument(
+        "words", nargs="*", metavar="EXPERIMENT key=value", help="e.g. ppo algo.gamma=0.98 robots=[h1,g1]"
+    )
+    parser.add_argument("--out", type=Path, default=Path("logs"), metavar="DIR", help="folder of all runs [logs]")
+    parser.add_argument("--resume", type=Path, metavar="RUN", help="continue this run directory")
+    parser.add_argument("--seed", type=int, metavar="N", help="the same as seed=N")
+    parser.add_argument("--device", metavar="cpu|cuda", help="where the learner computes, the same as run.device=...")
+    parser.add_argument("--scale", choices=known_names("scale"), help="lay cfg/scale/NAME.yaml over the experiment")
+    parser.add_argument("--allow-drift", action="store_true", help="resume although versions, robots or values changed")
+    parser.add_argument("--show", action="store_true", help="print the resolved configuration and stop")
+    return parser
+
+
+@dataclass(frozen=True)
+class _Request:
+    """What the command line asks for, checked."""
+
+    cfg: ExperimentCfg
+    changes: list[str]
+    """Keys on which a resumed run's configuration would change."""
+
+
+def _request(args: argparse.Namespace) -> _Request:
+    experiment = args.words[0] if args.words and "=" not in args.words[0] else None
+    overrides = args.words[1 if experiment else 0 :]
+    overrides += [f"seed={args.seed}"] if args.seed is not None else []
+    overrides += [f"run.device={args.device}"] if args.device else []
+    if args.resume is not None:
+        if args.scale:
+            raise ConfigError("--scale: a run keeps the scale it was started with.")
+        cfg, changes = open_run(args.resume, overrides)
+        if experiment not in (None, cfg.name):
+            raise ConfigError(f"--resume {args.resume}: this is a run of {cfg.name!r}, not of {experiment!r}.")
+        return _Request(cfg, changes)
+    if experiment is None:
+        raise ConfigError(
+            f"name an experiment: {', '.join(known_names('experiment'))}; or continue one with --resume RUN."
+        )
+    return _Request(load_experiment(experiment, overrides, args.scale), [])
+
+
+def _record(cfg: ExperimentCfg) -> dict[str, Any]:
+    """Provenance of a run, after checking every robot's files."""
+    from envs.robots.load import load_robot
+
+    specs = [load_robot(name) for name in cfg.robots]
+    return provenance(cfg.seed, {s.name: (s.yaml_path, s.urdf_path) for s in specs}, config_hash(cfg))
+
+
+def _prepare_torch(cfg: ExperimentCfg) -> None:
+    import torch
+
+    torch.set_num_threads(cfg.run.torch_threads)
+    if cfg.run.device != "cpu" and not torch.cuda.is_available():
+        raise ConfigError(f"run.device: {cfg.run.device} is not available here: torch finds no CUDA device. Use cpu.")
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run ``eagle train``."""
+    args = _parser().parse_intermixed_args(argv)
+    request = _request(args)
+    cfg = request.cfg
+    if args.show:
+        print(to_yaml(cfg), end="")
+        return 0
+    record = _record(cfg)
+    if args.resume is not None:
+        check_drift(args.resume, request.changes, record, args.allow_drift)
+    _prepare_torch(cfg)
+    run_dir = args.resume or create_run(cfg, args.out, record)
+    return _train(cfg, run_dir, resume=args.resume is not None)
+
+
+def _train(cfg: ExperimentCfg, run_dir: Path, *, resume: bool) -> int:
+    from rich.console import Console
+
+    from eagle_rl.runners.stages import run_experiment
+
+    from .environment import make_env_factory
+    from .mdp_summary import print_mdp
+
+    console = Console()
+    print_mdp(cfg.task, console)
+    console.print(f"{cfg.name}: {cfg.description}\nrun directory: {run_dir}", highlight=False)
+    run_experiment(cfg, run_dir, make_env_factory(cfg.run), resume, console)
+    console.print(
+        f"\nWatch it:     eagle play {run_dir}\nMeasure it:   eagle evaluate {run_dir}\n"
+        f"Curves:       tensorboard --logdir {run_dir}\nGo on:        eagle train --resume {run_dir}",
+        highlight=False,
+    )
+    return 0

@@ -1,0 +1,199 @@
+"""What types cannot say: bounds of single values, order of ranges, and agreement between values."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from .schema import CommandRangeCfg, EvaluationCfg, ExperimentCfg, SimCfg
+
+CONTROL_STEP = 0.02
+"""Control step of every task [s] (HugWBC 3)."""
+
+Fault = tuple[str, str]
+"""Dotted path of the value at fault, and what is wrong with it."""
+
+_Bound = tuple[str, Callable[[float], bool]]
+_POSITIVE: _Bound = ("above 0", lambda x: x > 0)
+_NOT_NEGATIVE: _Bound = ("0 or more", lambda x: x >= 0)
+_SHARE: _Bound = ("from 0 to 1", lambda x: 0 <= x <= 1)
+_POSITIVE_SHARE: _Bound = ("above 0 and at most 1", lambda x: 0 < x <= 1)
+_OPEN_SHARE: _Bound = ("above 0 and below 1", lambda x: 0 < x < 1)
+
+_WEIGHTS = "task.rewards.weights."
+
+_BOUNDS: dict[str, _Bound] = dict.fromkeys(
+    """
+    num_envs task.sim.physics_dt task.sim.decimation task.sim.solver_iterations task.sim.solver_ls_iterations
+    task.terrain.num_levels task.terrain.patch_size task.terrain.cell_size
+    task.control.action_scale task.control.action_clip task.control.hip_yaw_ratio
+    task.commands.resampling_time_s task.commands.curriculum.num_bins_lin_vel_x
+    task.commands.curriculum.num_bins_ang_vel_z task.gait.frequency task.gait.contact_smoothing
+    task.observations.history_length task.observations.clip
+    task.rewards.tracking_kappa task.rewards.contact_vel_kappa task.rewards.contact_force_kappa
+    task.rewards.foot_slip_kappa task.rewards.foot_swing_clip task.rewards.penalty_interval_steps
+    task.terminations.episode_length_s task.terminations.max_roll task.terminations.max_pitch
+    task.randomization.push_interval_s task.aids.interval_steps
+    algo.num_steps_per_env algo.num_learning_epochs algo.num_mini_batches algo.clip_param algo.learning_rate
+    algo.desired_kl algo.max_grad_norm algo.network.embedding_dim algo.network.init_std
+    plan.generalist_env_steps plan.max_rounds
+    evaluation.num_envs_per_robot evaluation.num_steps evaluation.physics_dt evaluation.decimation
+    run.torch_threads run.save_interval run.keep_checkpoints
+    """.split(),
+    _POSITIVE,
+)
+_BOUNDS |= dict.fromkeys(
+    """
+    task.commands.standing_probability task.commands.curriculum.weight_step
+    task.commands.curriculum.lin_vel_threshold task.commands.curriculum.ang_vel_threshold
+    task.commands.curriculum.contact_force_threshold task.commands.curriculum.contact_vel_threshold
+    task.gait.phase_offset task.aids.harness_decay task.aids.gait_shaping_decay
+    task.aids.min_episode_ratio task.aids.min_contact_match algo.lam plan.tolerance
+    """.split(),
+    _SHARE,
+)
+_BOUNDS |= dict.fromkeys(
+    """
+    task.control.min_effort_ratio task.control.min_effort_ratio_leg_pitch task.rewards.soft_limit_ratio
+    task.rewards.penalty_initial task.rewards.penalty_exponent algo.mirror_fraction algo.gamma
+    """.split(),
+    _POSITIVE_SHARE,
+)
+_BOUNDS["task.gait.stance_ratio"] = _OPEN_SHARE
+_SIGNED = {"seed", "evaluation.seed"}
+_POSITIVE_ITEMS = {f"algo.network.{part}_dims" for part in ("encoder", "estimator", "actor", "critic")} | {
+    "algo.network.std_range",
+    "algo.learning_rate_range",
+    "task.observations.scales.command",
+}
+_POSITIVE_RANGES = re.compile(r"task\.randomization\.(?:friction|(?!init_)\w+_scale)")
+
+
+def leaves(cfg: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Every value of a schema instance with its dotted path."""
+    for f in dataclasses.fields(cfg):
+        value = getattr(cfg, f.name)
+        if dataclasses.is_dataclass(value):
+            yield from leaves(value, f"{prefix}{f.name}.")
+        else:
+            yield prefix + f.name, value
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _scalar_fault(path: str, value: float, default: float) -> str | None:
+    if path in _SIGNED:
+        return None
+    if path.startswith(_WEIGHTS):
+        sign = "0 or more, it is a reward" if default > 0 else "0 or less, it is a penalty"
+        return None if value * default >= 0 else f"got {value!r}, expected {sign}"
+    words, holds = _BOUNDS.get(path, _NOT_NEGATIVE)
+    return None if holds(value) else f"got {value!r}, expected {words}"
+
+
+def _sequence_fault(path: str, value: tuple[Any, ...]) -> str | None:
+    if any(isinstance(v, str) for v in value):
+        return None
+    if not all(math.isfinite(v) for v in value):
+        return f"got {list(value)}, expected finite numbers"
+    if (path in _POSITIVE_ITEMS or _POSITIVE_RANGES.match(path)) and min(value, default=1) <= 0:
+        return f"got {list(value)}, expected numbers above 0"
+    if len(value) == 2 and not path.endswith("_dims") and value[0] > value[1]:
+        return f"got {list(value)}, expected the lower bound first"
+    return None
+
+
+def _single_faults(cfg: ExperimentCfg) -> Iterator[Fault]:
+    defaults = dict(leaves(ExperimentCfg(name=cfg.name)))
+    for path, value in leaves(cfg):
+        fault: str | None = None
+        if isinstance(value, tuple):
+            fault = _sequence_fault(path, value)
+        elif _is_number(value):
+            finite = math.isfinite(value)
+            fault = _scalar_fault(path, value, defaults[path]) if finite else f"got {value}, expected a finite number"
+        if fault:
+            yield path, fault
+
+
+def _stepping_faults(path: str, cfg: SimCfg | EvaluationCfg) -> Iterator[Fault]:
+    step = cfg.physics_dt * cfg.decimation
+    if abs(step - CONTROL_STEP) > 1e-9:
+        yield (
+            f"{path}.decimation",
+            f"physics_dt {cfg.physics_dt:g} x decimation {cfg.decimation} is {step:g} s, expected {CONTROL_STEP} s",
+        )
+
+
+def _curriculum_faults(path: str, cfg: CommandRangeCfg) -> Iterator[Fault]:
+    if cfg.initial[0] < cfg.finishing[0] or cfg.initial[1] > cfg.finishing[1]:
+        yield (
+            path,
+            f"initial {list(cfg.initial)} is not inside finishing {list(cfg.finishing)}; the curriculum only widens",
+        )
+
+
+def _scan_faults(path: str, scan: tuple[float, float, int]) -> Iterator[Fault]:
+    if scan[2] < 1 or scan[0] > scan[1]:
+        yield path, f"got {list(scan)}, expected first <= last and at least one point"
+
+
+def _task_faults(cfg: ExperimentCfg) -> Iterator[Fault]:
+    task = cfg.task
+    yield from _stepping_faults("task.sim", task.sim)
+    yield from _stepping_faults("evaluation", cfg.evaluation)
+    if task.commands.curriculum.enabled:
+        yield from _curriculum_faults("task.commands.lin_vel_x", task.commands.lin_vel_x)
+        yield from _curriculum_faults("task.commands.ang_vel_z", task.commands.ang_vel_z)
+    yield from _scan_faults("task.observations.scan_x", task.observations.scan_x)
+    yield from _scan_faults("task.observations.scan_y", task.observations.scan_y)
+    if task.observations.descriptor == "extended" and not task.observations.embodiment_observation:
+        yield "task.observations.descriptor", "extended needs embodiment_observation: true"
+    if task.terrain.cell_size > task.terrain.patch_size:
+        yield "task.terrain.cell_size", f"larger than patch_size {task.terrain.patch_size:g}"
+
+
+def _learner_faults(cfg: ExperimentCfg) -> Iterator[Fault]:
+    algo = cfg.algo
+    batch = cfg.num_envs * algo.num_steps_per_env
+    if algo.num_mini_batches > 0 and batch % algo.num_mini_batches:
+        yield (
+            "algo.num_mini_batches",
+            f"{algo.num_mini_batches} does not divide the batch of num_envs {cfg.num_envs} x "
+            f"num_steps_per_env {algo.num_steps_per_env} = {batch}",
+        )
+    low, high = algo.learning_rate_range
+    if not low <= algo.learning_rate <= high:
+        yield "algo.learning_rate", f"{algo.learning_rate:g} is outside learning_rate_range [{low:g}, {high:g}]"
+    low, high = algo.network.std_range
+    if not low <= algo.network.init_std <= high:
+        yield "algo.network.init_std", f"{algo.network.init_std:g} is outside std_range [{low:g}, {high:g}]"
+
+
+def _plan_faults(cfg: ExperimentCfg) -> Iterator[Fault]:
+    if not cfg.robots:
+        yield "robots", "expected at least one robot"
+    repeated = sorted({name for name in cfg.robots if cfg.robots.count(name) > 1})
+    if repeated:
+        yield "robots", f"named twice: {', '.join(repeated)}"
+    if cfg.num_envs < len(cfg.robots):
+        yield "num_envs", f"{cfg.num_envs} is less than one environment for each of {len(cfg.robots)} robots"
+    if cfg.plan.method != "ppo":
+        for key in ("specialist_env_steps", "distill_env_steps"):
+            if getattr(cfg.plan, key) == 0:
+                yield f"plan.{key}", f"0, but method {cfg.plan.method} needs a budget for this stage"
+    if not re.fullmatch(r"cpu|cuda(:\d+)?", cfg.run.device):
+        yield "run.device", f"got {cfg.run.device!r}, expected cpu, cuda or cuda:N"
+    if not re.fullmatch(r"\w[\w.-]*", cfg.name):
+        yield "name", f"got {cfg.name!r}, expected letters, digits, - and _: it names the run's folder"
+
+
+def find_faults(cfg: ExperimentCfg) -> list[Fault]:
+    """Everything wrong with a configuration whose types are right, in the order of the schema's groups."""
+    checks = (_single_faults, _task_faults, _learner_faults, _plan_faults)
+    return [fault for check in checks for fault in check(cfg)]

@@ -1,0 +1,1 @@
+"""Measuring policies: the tracking protocol, tables and figures."""

@@ -1,0 +1,161 @@
+"""Run a policy through the protocol, robot by robot, in chunks of environments that bound the memory."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from eagle_rl.config.schema import EvaluationCfg, TaskCfg
+from eagle_rl.errors import CheckpointError
+from eagle_rl.evaluation.metrics import SETTLING_TIME_S, RobotMetrics, TrackingAccumulator
+from eagle_rl.evaluation.protocol import draw_commands, evaluation_task, step_dt, steps_per_draw, varied_commands
+
+FORMAT = 1
+"""Version of the JSON an evaluation is stored as."""
+
+_TILE = 128
+"""Rows the policy sees at once. Matrix products of another height may round differently, and contacts amplify that;
+so the policy always sees full tiles, and chunks are whole tiles."""
+
+Policy = Callable[[TensorDict], Tensor]
+"""Deterministic actions (N, 32) for observations (N,)."""
+
+
+class TrackingEnv(Protocol):
+    """What an evaluation needs of an environment."""
+
+    num_envs: int
+
+    def pin_commands(self, command: Tensor | None) -> None:
+        """Command this, shape (N, 5), until told otherwise."""
+
+    def get_observations(self) -> TensorDict:
+        """Observations under the present command."""
+
+    def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
+        """Advance one control step: observations, rewards, dones and extras with ``time_outs``."""
+
+    def tracking_errors(self) -> Tensor:
+        """Absolute errors of the last step, before any reset, shape (N, 5)."""
+
+
+MakeEnv = Callable[[Sequence[str], int, TaskCfg, int], Any]
+"""Builds an environment from robot names, number of environments, task and seed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluationResult:
+    """Scores of one policy, with everything needed to repeat them."""
+
+    checkpoint: str
+    """sha256 of the checkpoint's content."""
+    protocol: EvaluationCfg
+    robots: Mapping[str, RobotMetrics]
+    seed: int
+    """Seed of the training run."""
+
+    def to_json(self) -> str:
+        """One JSON document."""
+        return json.dumps({"format": FORMAT, **dataclasses.asdict(self)}, indent=1)
+
+    @classmethod
+    def from_json(cls, text: str) -> EvaluationResult:
+        """Read back ``to_json``."""
+        data = json.loads(text)
+        if data.get("format") != FORMAT:
+            raise CheckpointError(
+                f"evaluation result: format {data.get('format')!r}, expected {FORMAT}. Evaluate again."
+            )
+        return cls(
+            checkpoint=data["checkpoint"],
+            protocol=EvaluationCfg(**data["protocol"]),
+            robots={name: RobotMetrics.from_dict(robot) for name, robot in data["robots"].items()},
+            seed=data["seed"],
+        )
+
+    @classmethod
+    def read(cls, path: Path) -> EvaluationResult:
+        """Read a result file."""
+        return cls.from_json(path.read_text(encoding="utf-8"))
+
+
+def evaluate(
+    policy: Policy,
+    make_env: MakeEnv,
+    robots: Sequence[str],
+    task: TaskCfg,
+    ev: EvaluationCfg,
+    chunk_envs: int = 512,
+    on_step: Callable[[int], None] = lambda steps: None,
+) -> dict[str, RobotMetrics]:
+    """Score a policy on each robot.
+
+    Args:
+        policy: deterministic actions from observations.
+        make_env: builds a TrackingEnv.
+        robots: robots to judge.
+        task: the task it was trained in; the protocol makes it an evaluation.
+        ev: the protocol.
+        chunk_envs: environments simulated together, rounded up to whole tiles; changes memory, not the result. (With
+            ``ev.randomization`` or ``ev.noise`` each chunk draws from a seed of its own, so the draws do depend on it.)
+        on_step: told after every control step how many environment steps were made.
+    """
+    task = evaluation_task(task, ev)
+    size = -(-chunk_envs // _TILE) * _TILE
+    metrics = {}
+    for robot in robots:
+        commands = draw_commands(task.commands, ev, robot, ev.num_envs_per_robot)
+        varied = varied_commands(ev, ev.num_envs_per_robot)
+        parts = []
+        for start in range(0, ev.num_envs_per_robot, size):
+            chunk = commands[start : start + size]
+            env = make_env([robot], len(chunk), task, ev.seed + start)
+            accumulator = TrackingAccumulator(varied[start : start + size])
+            parts.append(_run_chunk(policy, env, chunk, accumulator, task, ev, on_step))
+        metrics[robot] = TrackingAccumulator.join(parts).finish()
+    return metrics
+
+
+@torch.inference_mode()
+def _run_chunk(
+    policy: Policy,
+    env: TrackingEnv,
+    commands: Tensor,
+    accumulator: TrackingAccumulator,
+    task: TaskCfg,
+    ev: EvaluationCfg,
+    on_step: Callable[[int], None],
+) -> TrackingAccumulator:
+    """Roll out one chunk of environments; commands have shape (N, draws, 5)."""
+    draw_steps = steps_per_draw(ev)
+    settling_steps = round(SETTLING_TIME_S / step_dt(task))
+    for t in range(ev.num_steps):
+        command = commands[:, t // draw_steps]
+        settled = t % draw_steps >= settling_steps
+        if not accumulator.alive.any():
+            accumulator.add(torch.zeros_like(command), command, ~accumulator.alive, settled)
+            continue
+        if t % draw_steps == 0:
+            env.pin_commands(command)
+            obs = env.get_observations()
+        obs, _, dones, extras = env.step(tiled(policy, obs))
+        fell = dones.bool() & ~extras["time_outs"].bool()
+        accumulator.add(env.tracking_errors().cpu(), command, fell.cpu(), settled)
+        on_step(len(command))
+    return accumulator
+
+
+def tiled(policy: Policy, obs: TensorDict) -> Tensor:
+    """Actions of the policy, computed in tiles of equal height, the last one filled up with its own first row."""
+    num_envs = len(obs)
+    rows = torch.arange(-(-num_envs // _TILE) * _TILE, device=obs.device)
+    rows = torch.where(rows < num_envs, rows, (rows // _TILE) * _TILE)
+    return torch.cat([policy(obs[tile]) for tile in rows.split(_TILE)])[:num_envs]

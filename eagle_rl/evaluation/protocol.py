@@ -1,0 +1,73 @@
+"""What is commanded during an evaluation, and in which version of the task.
+
+The commands of an environment depend only on (seed, robot, environment index): neither the number of environments nor
+how they are batched moves anybody's commands. They are uniform on the finishing ranges and are *not* zeroed inside the
+training dead zone, so that the errors of a robot that ignores its command have closed forms.
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from eagle_rl.config.schema import CommandsCfg, EvaluationCfg, TaskCfg
+
+COMMANDS = ("lin_vel_x", "lin_vel_y", "ang_vel_z", "base_height", "body_pitch")
+"""Names of the five commands in their order in every (..., 5) tensor."""
+
+
+def step_dt(task: TaskCfg) -> float:
+    """Duration of one control step [s]."""
+    return task.sim.physics_dt * task.sim.decimation
+
+
+def evaluation_task(task: TaskCfg, ev: EvaluationCfg) -> TaskCfg:
+    """The task a policy is judged in: no curriculum, no aids, no time-out before the last step.
+
+    Sensor noise and randomized dynamics are off unless ``ev`` asks for them; pushes are then at full strength.
+    """
+    seconds = (ev.num_steps + 1) * ev.physics_dt * ev.decimation
+    return replace(
+        task,
+        sim=replace(task.sim, physics_dt=ev.physics_dt, decimation=ev.decimation),
+        commands=replace(task.commands, curriculum=replace(task.commands.curriculum, enabled=False)),
+        observations=replace(task.observations, enable_corruption=ev.noise),
+        rewards=replace(task.rewards, penalty_initial=1.0),
+        terminations=replace(task.terminations, episode_length_s=seconds),
+        randomization=replace(task.randomization, enabled=ev.randomization),
+        aids=replace(task.aids, harness=0.0, gait_shaping=0.0),
+    )
+
+
+def steps_per_draw(ev: EvaluationCfg) -> int:
+    """Control steps for which a command stays the same."""
+    if ev.resampling_time_s <= 0.0:
+        return ev.num_steps
+    return max(1, round(ev.resampling_time_s / (ev.physics_dt * ev.decimation)))
+
+
+def varied_commands(ev: EvaluationCfg, num_envs: int) -> Tensor:
+    """Which commands of each environment are drawn and judged, bool, shape (num_envs, 5).
+
+    ``single`` gives environment i the dimension i mod 5, ``joint`` all five.
+    """
+    if ev.protocol == "joint":
+        return torch.ones(num_envs, len(COMMANDS), dtype=torch.bool)
+    return torch.arange(num_envs).unsqueeze(1) % len(COMMANDS) == torch.arange(len(COMMANDS))
+
+
+def draw_commands(commands: CommandsCfg, ev: EvaluationCfg, robot: str, num_envs: int) -> Tensor:
+    """Commands of one robot's environments, shape (num_envs, draws, 5), float64.
+
+    One draw lasts ``steps_per_draw`` control steps; commands that are not varied are zero.
+    """
+    draws = math.ceil(ev.num_steps / steps_per_draw(ev))
+    generator = np.random.default_rng([ev.seed, zlib.crc32(robot.encode())])
+    unit = torch.from_numpy(generator.random((num_envs, draws, len(COMMANDS))))
+    low, high = torch.tensor([getattr(commands, name).finishing for name in COMMANDS], dtype=torch.float64).T
+    return (low + (high - low) * unit) * varied_commands(ev, num_envs).unsqueeze(1)

@@ -1,0 +1,222 @@
+"""The tracking table: robots by methods by five errors, with floors and the paper's numbers, in four formats."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import json
+import statistics
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from eagle_rl.config.schema import EvaluationCfg
+from eagle_rl.errors import ConfigError
+from eagle_rl.evaluation.evaluate import EvaluationResult
+from eagle_rl.evaluation.metrics import RobotMetrics
+from eagle_rl.evaluation.reference import FLOORS, PAPER, STAND_STILL, Errors
+
+Falls = Literal["charged", "errors"]
+"""``charged`` counts |c_d| for every step after a fall, ``errors`` leaves those steps out."""
+
+SYMBOLS = ("E_vx", "E_vy", "E_w", "E_h", "E_p")
+UNITS = ("m/s", "m/s", "rad/s", "m", "rad")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cell:
+    """One error of one method on one robot."""
+
+    mean: float | None
+    std: float | None = None
+    """Over seeds; None for one seed."""
+    paper: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """One method on one robot."""
+
+    robot: str
+    method: str
+    cells: tuple[Cell, ...]
+    survival: Cell | None = None
+    seeds: tuple[int, ...] = ()
+    """Training seeds; empty for a reference row."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Table:
+    """Rows grouped by robot, and what has to be known to repeat them."""
+
+    rows: tuple[Row, ...]
+    caption: str
+    checkpoints: Mapping[str, tuple[str, ...]]
+    """sha256 of every checkpoint, by method."""
+
+
+def pooled_score(robots: Mapping[str, RobotMetrics]) -> float:
+    """Mean over robots and commands of the charged error as a share of standing still: 0 is perfect, 1 is idle."""
+    shares = [
+        charged / floor
+        for metrics in robots.values()
+        for charged, floor in zip(metrics.subsets["all"].charged, STAND_STILL, strict=True)
+        if charged is not None
+    ]
+    return statistics.fmean(shares)
+
+
+def _over_seeds(values: Sequence[float | None], paper: float | None = None) -> Cell:
+    """Mean and standard deviation of what several seeds scored."""
+    known = [v for v in values if v is not None]
+    return Cell(
+        mean=statistics.fmean(known) if known else None,
+        std=statistics.stdev(known) if len(known) > 1 else None,
+        paper=paper,
+    )
+
+
+def describe(ev: EvaluationCfg, subset: str, falls: Falls) -> str:
+    """The protocol in words."""
+    drawn = "one command drawn, the others zero" if ev.protocol == "single" else "all five commands drawn"
+    held = f"redrawn every {ev.resampling_time_s:g} s" if ev.resampling_time_s > 0 else "kept for the episode"
+    dynamics = "randomized dynamics and pushes" if ev.randomization else "nominal dynamics"
+    after = "steps after a fall are charged |c_d|" if falls == "charged" else "steps after a fall are left out"
+    return (
+        f"Mean absolute tracking error over {ev.num_envs_per_robot} environments x {ev.num_steps} steps a robot; "
+        f"{drawn} from the finishing ranges, {held}; {dynamics}, {'noisy' if ev.noise else 'clean'} sensors, physics "
+        f"{ev.physics_dt:g} s x {ev.decimation}, seed {ev.seed}; subset: {subset}; {after}."
+    )
+
+
+def _common_protocol(results: Iterable[EvaluationResult]) -> EvaluationCfg:
+    """The protocol all results share."""
+    protocols = {result.protocol for result in results}
+    if len(protocols) != 1:
+        raise ConfigError(f"A table needs results of one protocol, got {len(protocols)}: evaluate all methods alike.")
+    return protocols.pop()
+
+
+def tracking_table(
+    results: Mapping[str, Sequence[EvaluationResult]],
+    subset: str = "all",
+    falls: Falls = "charged",
+    paper: Mapping[str, Mapping[str, Errors]] = PAPER,
+) -> Table:
+    """Gather results into a table.
+
+    Args:
+        results: by method, one result per training seed.
+        subset: one of ``metrics.SUBSETS``; the floors are of all steps and are left out for others.
+        falls: what counts after a fall.
+        paper: the paper's errors by method and robot.
+    """
+    ev = _common_protocol(result for runs in results.values() for result in runs)
+    robots = list(dict.fromkeys(robot for runs in results.values() for result in runs for robot in result.robots))
+    rows = []
+    for robot in robots:
+        if subset == "all":
+            rows += [
+                Row(robot=robot, method=name, cells=tuple(Cell(mean=e) for e in errors))
+                for name, errors in FLOORS.items()
+            ]
+        for method, runs in results.items():
+            judged = [run for run in runs if robot in run.robots]
+            if judged:
+                rows.append(_row(robot, method, judged, subset, falls, paper.get(method, {}).get(robot)))
+    return Table(
+        rows=tuple(rows),
+        caption=describe(ev, subset, falls),
+        checkpoints={method: tuple(run.checkpoint for run in runs) for method, runs in results.items()},
+    )
+
+
+def _row(
+    robot: str, method: str, runs: Sequence[EvaluationResult], subset: str, falls: Falls, paper: Errors | None
+) -> Row:
+    """One method on one robot, over its seeds."""
+    errors = [getattr(run.robots[robot].subsets[subset], falls) for run in runs]
+    printed = paper or (None,) * len(SYMBOLS)
+    return Row(
+        robot=robot,
+        method=method,
+        cells=tuple(_over_seeds([e[d] for e in errors], printed[d]) for d in range(len(SYMBOLS))),
+        survival=_over_seeds([run.robots[robot].survival for run in runs]),
+        seeds=tuple(run.seed for run in runs),
+    )
+
+
+def _number(value: float | None, digits: int = 3) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def _text(cell: Cell, plus_minus: str = " ± ") -> str:
+    """``mean ± std [paper]``."""
+    spread = f"{plus_minus}{_number(cell.std)}" if cell.std is not None else ""
+    paper = f" [{_number(cell.paper)}]" if cell.paper is not None else ""
+    return _number(cell.mean) + spread + paper
+
+
+def _percent(cell: Cell | None) -> str:
+    return "-" if cell is None or cell.mean is None else f"{100 * cell.mean:.1f} %"
+
+
+def to_markdown(table: Table) -> str:
+    """GitHub Markdown, one table for all robots; the paper's numbers in brackets."""
+    head = ["robot", "method", *(f"{s} [{u}]" for s, u in zip(SYMBOLS, UNITS, strict=True)), "survival", "seeds"]
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    for row in table.rows:
+        cells = [row.robot, row.method, *map(_text, row.cells), _percent(row.survival), str(len(row.seeds) or "-")]
+        lines.append("| " + " | ".join(cells) + " |")
+    hashes = [f"- {method}: {', '.join(h[:12] for h in hashes)}" for method, hashes in table.checkpoints.items()]
+    note = "In brackets: the paper's number. ± is the standard deviation over training seeds."
+    return "\n".join([*lines, "", table.caption, note, "", "Checkpoints (sha256):", "", *hashes, ""])
+
+
+def to_csv(table: Table) -> str:
+    """One line per robot and method; full precision."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    kinds = ("", "_std", "_paper")
+    writer.writerow(["robot", "method", *(s + kind for s in SYMBOLS for kind in kinds), "survival", "num_seeds"])
+    for row in table.rows:
+        values = [value for cell in row.cells for value in (cell.mean, cell.std, cell.paper)]
+        survival = row.survival.mean if row.survival else None
+        writer.writerow([row.robot, row.method, *values, survival, len(row.seeds)])
+    return text.getvalue()
+
+
+def _latex(text: str) -> str:
+    """Escape what LaTeX reads as a command."""
+    return text.replace("%", r"\%").replace("_", r"\_").replace("|c\\_d|", "$|c_d|$")
+
+
+def to_latex(table: Table) -> str:
+    """A booktabs table."""
+    symbols = ("$E_{v_x}$", "$E_{v_y}$", r"$E_{\omega}$", "$E_h$", "$E_p$")
+    lines = [
+        r"\begin{table}",
+        rf"\caption{{{_latex(table.caption)} In brackets: the paper's number.}}",
+        r"\begin{tabular}{ll" + "r" * (len(symbols) + 1) + "}",
+        r"\toprule",
+        " & ".join(["robot", "method", *symbols, "survival"]) + r" \\",
+    ]
+    robot = None
+    for row in table.rows:
+        if row.robot != robot:
+            lines.append(r"\midrule")
+        cells = [_latex(_text(cell, "@").replace("@", r" $\pm$ ")) for cell in row.cells]
+        name = _latex(row.robot) if row.robot != robot else ""
+        lines.append(" & ".join([name, _latex(row.method), *cells, _latex(_percent(row.survival))]) + r" \\")
+        robot = row.robot
+    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", r"\end{table}", ""])
+
+
+def to_json(table: Table) -> str:
+    """Everything, for programs."""
+    return json.dumps(dataclasses.asdict(table), indent=1)
+
+
+FORMATS = {"md": to_markdown, "csv": to_csv, "tex": to_latex, "json": to_json}
+"""Writer of each file suffix."""

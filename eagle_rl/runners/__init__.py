@@ -1,0 +1,1 @@
+"""Runs: the training loop, its checkpoints and its logs."""

@@ -1,0 +1,252 @@
+"""Checkpoints that can be trusted: a data file and a manifest that proves it whole.
+
+``model_<iteration>.pt`` holds tensors and plain values only; ``model_<iteration>.json`` names its size and sha256, what
+it belongs to, and its own digest. Both are written to a temporary file, flushed to disk and moved into place, the
+manifest last, so that whatever has a manifest was written completely.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+import re
+import warnings
+import zipfile
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from eagle_rl.errors import CheckpointError
+from eagle_rl.models import EagleActor
+from eagle_rl.runners.provenance import Provenance
+
+FORMAT_VERSION = 1
+MAX_MANIFEST_BYTES = 4 << 20
+
+Manifest = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A verified checkpoint."""
+
+    path: Path
+    """Its data file."""
+    manifest: Manifest
+    state: dict[str, Any] = field(repr=False)
+
+
+def save_checkpoint(
+    folder: Path,
+    state: Mapping[str, Any],
+    provenance: Provenance,
+    *,
+    iteration: int,
+    env_steps: int,
+    score: float | None = None,
+    stage_end: bool = False,
+) -> Path:
+    """Write ``model_<iteration>`` and return the path of its data file.
+
+    Args:
+        folder: the run's ``checkpoints`` folder, made if it does not exist.
+        state: nested dicts and lists of tensors, numbers and strings.
+        provenance: what the checkpoint belongs to.
+        iteration: completed iterations of the stage.
+        env_steps: environment steps spent in the stage.
+        score: mean reward, by which the best checkpoint is found.
+        stage_end: whether this is the last checkpoint of its stage, which is never pruned.
+    """
+    buffer = io.BytesIO()
+    torch.save(dict(state), buffer)
+    data = buffer.getvalue()
+    path = folder / f"model_{iteration}.pt"
+    manifest = provenance.as_manifest() | {
+        "format": FORMAT_VERSION,
+        "file": path.name,
+        "bytes": len(data),
+        "sha256": hashlib.sha256(data).hexdigest(),
+        "iteration": iteration,
+        "env_steps": env_steps,
+        "score": score,
+        "stage_end": stage_end,
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, data)
+    write_atomically(path.with_suffix(".json"), _encode_manifest(manifest))
+    return path
+
+
+def load_checkpoint(path: Path, slot_table_hash: str | None = None, device: str | torch.device = "cpu") -> Checkpoint:
+    """Read a checkpoint whole and return it only if everything about it is sound.
+
+    Args:
+        path: its data file or its manifest.
+        slot_table_hash: refuse checkpoints of another slot table, if given.
+        device: where tensors are put; the random states among them stay usable only on the CPU.
+    """
+    path = Path(path).with_suffix(".pt")
+    manifest = read_manifest(path)
+    data = _read_verified(path, manifest)
+    if slot_table_hash is not None and manifest["slot_table_hash"] != slot_table_hash:
+        raise CheckpointError(
+            f"{path}: made for another slot table ({manifest['slot_table_hash'][:12]}), "
+            f"expected {slot_table_hash[:12]}: its actions would move the wrong joints. Use the version that wrote it."
+        )
+    return Checkpoint(path, manifest, _unpickle(path, data, device))
+
+
+def load_actor(
+    path: Path, device: str | torch.device = "cpu", slot_table_hash: str | None = None
+) -> tuple[EagleActor, Manifest]:
+    """The policy of a checkpoint, in evaluation mode, and the manifest with the resolved ``config``."""
+    checkpoint = load_checkpoint(path, slot_table_hash)
+    try:
+        actor = EagleActor.from_architecture(checkpoint.state["architecture"])
+        actor.load_state_dict(checkpoint.state["algorithm"]["actor_state_dict"])
+    except (KeyError, TypeError, RuntimeError, ValueError) as error:
+        raise CheckpointError(f"{checkpoint.path}: does not hold a policy of this version: {error}") from error
+    return actor.to(device).eval(), checkpoint.manifest
+
+
+def read_manifest(path: Path) -> Manifest:
+    """The manifest of a data file, checked against its own digest and format."""
+    source = Path(path).with_suffix(".json")
+    try:
+        with source.open("rb") as file:
+            text = file.read(MAX_MANIFEST_BYTES + 1)
+    except FileNotFoundError as error:
+        raise CheckpointError(f"{source}: no such manifest. A data file without one was never completed.") from error
+    except OSError as error:
+        raise CheckpointError(f"{source}: cannot be read: {error.strerror}.") from error
+    try:
+        manifest = json.loads(text)
+        digest = manifest.pop("digest")
+        sound = _encode_manifest(manifest) == text and isinstance(digest, str)
+    except (ValueError, AttributeError, KeyError, TypeError, RecursionError):
+        sound = False
+    if not sound:
+        raise CheckpointError(f"{source}: damaged: it does not match its own digest. Use another checkpoint.")
+    if manifest.get("format") != FORMAT_VERSION:
+        raise CheckpointError(
+            f"{source}: format {manifest.get('format')}, expected {FORMAT_VERSION}. Use the version that wrote it."
+        )
+    if manifest["file"] != source.with_suffix(".pt").name:
+        raise CheckpointError(f"{source}: names {manifest['file']!r} as its data, expected its neighbour of that name.")
+    return manifest
+
+
+def verify_checkpoint(path: Path) -> Manifest:
+    """Check manifest, size and sha256 without opening the data; return the manifest."""
+    manifest = read_manifest(path)
+    _read_verified(Path(path).with_suffix(".pt"), manifest)
+    return manifest
+
+
+def latest_checkpoint(folder: Path) -> Path | None:
+    """The verified checkpoint of the highest iteration; damaged ones are passed over with a warning."""
+    for path in sorted(_data_files(folder), key=iteration_of, reverse=True):
+        try:
+            verify_checkpoint(path)
+        except CheckpointError as error:
+            warnings.warn(f"Passing over a checkpoint. {error}", stacklevel=2)
+        else:
+            return path
+    return None
+
+
+def best_checkpoint(folder: Path) -> Path | None:
+    """The checkpoint with the highest score."""
+    scored = [(m["score"], path) for path, m in _manifests(folder) if m["score"] is not None]
+    return max(scored, default=(None, None), key=lambda item: (item[0], iteration_of(item[1])))[1]
+
+
+def prune_checkpoints(folder: Path, keep: int) -> None:
+    """Delete all but the last ``keep``, the best, and the ends of stages."""
+    manifests = dict(_manifests(folder))
+    last = sorted(manifests, key=iteration_of)[-keep:]
+    for path in set(manifests) - {*last, best_checkpoint(folder)}:
+        if not manifests[path]["stage_end"]:
+            path.with_suffix(".json").unlink(missing_ok=True)
+            path.unlink(missing_ok=True)
+
+
+def iteration_of(path: Path) -> int:
+    """Number in the name of a checkpoint."""
+    match = re.fullmatch(r"model_(\d+)", path.stem)
+    if match is None:
+        raise CheckpointError(f"{path}: not a checkpoint; the name should be model_<iteration>.pt.")
+    return int(match[1])
+
+
+def write_atomically(path: Path, data: bytes) -> None:
+    """Replace ``path`` by ``data``: at any moment it is the old file or the new one, also after a power cut."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with temporary.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    descriptor = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _encode_manifest(manifest: Manifest) -> bytes:
+    """The one spelling of a manifest, with its digest."""
+    digest = hashlib.sha256(json.dumps(manifest, sort_keys=True).encode()).hexdigest()
+    return (json.dumps(manifest | {"digest": digest}, sort_keys=True, indent=1) + "\n").encode()
+
+
+def _data_files(folder: Path) -> list[Path]:
+    return [path for path in Path(folder).glob("model_*.pt") if re.fullmatch(r"model_\d+", path.stem)]
+
+
+def _manifests(folder: Path) -> Iterator[tuple[Path, Manifest]]:
+    """Readable manifests of a folder, by data file."""
+    for path in _data_files(folder):
+        try:
+            yield path, read_manifest(path)
+        except CheckpointError:
+            continue
+
+
+def _read_verified(path: Path, manifest: Manifest) -> bytes:
+    """The data of a checkpoint, refused unless it is what the manifest promises."""
+    try:
+        size = path.stat().st_size
+        if size != manifest["bytes"]:
+            raise CheckpointError(f"{path}: damaged: {size} bytes, its manifest promises {manifest['bytes']}.")
+        data = path.read_bytes()
+    except OSError as error:
+        raise CheckpointError(f"{path}: cannot be read: {error.strerror}.") from error
+    if hashlib.sha256(data).hexdigest() != manifest["sha256"]:
+        raise CheckpointError(f"{path}: damaged: its sha256 is not the one in its manifest. Use another checkpoint.")
+    return data
+
+
+def _unpickle(path: Path, data: bytes, device: str | torch.device) -> dict[str, Any]:
+    """Tensors and plain values; anything that would run code, or unfold in memory, is refused."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            if any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()):
+                raise CheckpointError(f"{path}: refused: holds compressed entries, which no checkpoint of ours does.")
+        state = torch.load(io.BytesIO(data), map_location=device, weights_only=True)
+    except CheckpointError:
+        raise
+    except Exception as error:
+        reason = str(error).splitlines()[0]
+        raise CheckpointError(f"{path}: refused: holds more than tensors and plain values ({reason}).") from error
+    if not isinstance(state, dict):
+        raise CheckpointError(f"{path}: refused: holds a {type(state).__name__}, expected a dict.")
+    return state

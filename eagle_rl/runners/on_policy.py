@@ -1,0 +1,321 @@
+"""The training loop: collect, update, log, save, and go on exactly where it stopped."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import io
+import os
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from rsl_rl.env import VecEnv
+from rsl_rl.runners import OnPolicyRunner
+
+from eagle_rl.algorithms.eagle_ppo import EaglePPO
+from eagle_rl.algorithms.specialists import SpecialistBank
+from eagle_rl.config.schema import AlgoCfg, RunCfg
+from eagle_rl.errors import CheckpointError, HealthError, Interrupted
+from eagle_rl.models import EagleActor
+from eagle_rl.models.actor import ACTOR_INPUTS
+from eagle_rl.runners import checkpoint as ckpt
+from eagle_rl.runners.health import require_finite
+from eagle_rl.runners.interrupt import InterruptGuard
+from eagle_rl.runners.progress import ProgressReport
+from eagle_rl.runners.provenance import Provenance
+from eagle_rl.runners.training_log import TrainingLog
+
+
+def make_train_cfg(algo: AlgoCfg, run: RunCfg, *, history_length: int = 5, seed: int = 1) -> dict[str, Any]:
+    """The configuration rsl_rl's runner and algorithm take.
+
+    Args:
+        algo: losses, schedule and networks.
+        run: device and checkpoints.
+        history_length: K of the environment's history group.
+        seed: seeds initial weights, action noise and minibatches.
+    """
+    net = algo.network
+    return {
+        "seed": seed,
+        "num_steps_per_env": algo.num_steps_per_env,
+        "save_interval": run.save_interval,
+        "keep_checkpoints": run.keep_checkpoints,
+        "obs_groups": {"actor": list(ACTOR_INPUTS), "critic": ["critic"], "estimate": ["estimate"]},
+        "algorithm": {"class_name": EaglePPO, "cfg": algo},
+        "actor": {
+            "class_name": EagleActor,
+            "history_length": history_length,
+            "hidden_dims": net.actor_dims,
+            "encoder_dims": net.encoder_dims,
+            "estimator_dims": net.estimator_dims,
+            "embedding_dim": net.embedding_dim,
+            "activation": net.activation,
+            "init_std": net.init_std,
+            "std_range": net.std_range,
+        },
+        "critic": {"class_name": "MLPModel", "hidden_dims": net.critic_dims, "activation": net.activation},
+    }
+
+
+class EagleRunner(OnPolicyRunner):
+    """Trains one policy in one environment; one stage of a run."""
+
+    alg: EaglePPO
+
+    def __init__(
+        self,
+        env: VecEnv,
+        train_cfg: dict[str, Any],
+        log_dir: Path | str | None = None,
+        device: str = "cpu",
+        provenance: Provenance | None = None,
+    ) -> None:
+        """Build the learner for ``env`` from :func:`make_train_cfg`; write under ``log_dir``, or nowhere."""
+        torch.manual_seed(train_cfg["seed"])
+        with contextlib.redirect_stdout(io.StringIO()):  # rsl_rl prints every layer
+            super().__init__(env, train_cfg, None, device)
+        if self.is_distributed:
+            self.alg.broadcast_parameters()
+        torch.manual_seed(train_cfg["seed"] + self.gpu_global_rank)
+        self.provenance = provenance or Provenance()
+        self.folder = Path(log_dir) if log_dir is not None and self.gpu_global_rank == 0 else None
+        self.robot = env.get_observations()["robot"].to(device)
+        self.logger = TrainingLog(self.folder, self.robot, env.robot_names)
+        self.env_steps = 0
+        self.wall_time = 0.0
+        self._score: float | None = None
+        self._saved_iteration: int | None = None
+
+    # --- training ---------------------------------------------------------------------------------------------------
+
+    def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = True) -> None:
+        """Train, then save.
+
+        A first SIGINT or SIGTERM ends training after the iteration and raises :class:`Interrupted` once it is saved.
+
+        Args:
+            num_learning_iterations: iterations to add to those done.
+            init_at_random_ep_len: spread the ages of the first episodes, so that not all end at once.
+        """
+        last = self.current_learning_iteration + num_learning_iterations
+        if init_at_random_ep_len and self.current_learning_iteration == 0:
+            ages = torch.randint_like(self.env.episode_length_buf, high=int(self.env.max_episode_length))
+            self.env.episode_length_buf = ages
+        self.alg.train_mode()
+        self._obs = self.env.get_observations().to(self.device)
+        self.logger.open(self.current_learning_iteration + 1)
+        progress = ProgressReport(self.provenance.stage, self.current_learning_iteration, last)
+        try:
+            with InterruptGuard() as interrupt, progress:
+                while self.current_learning_iteration < last:
+                    scalars = self._iterate()
+                    self.logger.write(self.current_learning_iteration, scalars)
+                    if self.gpu_global_rank == 0:
+                        progress.update(self.current_learning_iteration, self.env_steps, scalars)
+                    self._save_now_and_then(scalars)
+                    if self._any_process(interrupt.requested):
+                        raise Interrupted(f"Interrupted after iteration {self.current_learning_iteration}.")
+        except Interrupted:
+            self.save()
+            raise
+        except HealthError:
+            if not self.is_distributed:  # the other processes cannot be asked for their part of the state
+                self.save()
+            raise
+        finally:
+            self.logger.close()
+        self.save(stage_end=True)
+
+    def _iterate(self) -> dict[str, float]:
+        """Collect one rollout and learn from it; return the iteration's scalars by tag."""
+        start = time.perf_counter()
+        with torch.inference_mode():
+            for _ in range(self.cfg["num_steps_per_env"]):
+                self._step()
+            self.alg.compute_returns(self._obs)
+        collected = time.perf_counter()
+        losses = self.alg.update()
+        learned = time.perf_counter()
+        self.current_learning_iteration += 1
+        steps = self.cfg["num_steps_per_env"] * self.env.num_envs * self.gpu_world_size
+        self.env_steps += steps
+        self.wall_time += learned - start
+        std = self.alg.actor.output_std
+        return self.logger.collect() | losses | {
+            "Loss/learning_rate": self.alg.learning_rate,
+            "Policy/mean_std": (std.sum() / (std > 0).sum()).item(),
+            "Perf/total_fps": steps / (learned - start),
+            "Perf/collection_time": collected - start,
+            "Perf/learning_time": learned - collected,
+            "Perf/env_steps": self.env_steps,
+            "Perf/wall_time": self.wall_time,
+        }
+
+    def _step(self) -> None:
+        """One control step of every environment."""
+        actions = self.alg.act(self._obs)
+        obs, rewards, dones, extras = self.env.step(actions.to(self.env.device))
+        self._obs, rewards, dones = obs.to(self.device), rewards.to(self.device), dones.to(self.device)
+        tensors = {name: x for name, x in self._obs.items() if x.is_floating_point()} | {"rewards": rewards}
+        require_finite(tensors, self.robot, self.env.robot_names)
+        self.alg.process_env_step(self._obs, rewards, dones, extras)
+        self.logger.add_step(rewards, dones, extras)
+
+    def imitate(self, specialists: Sequence[EagleActor], method: Literal["distill", "kickstarting"]) -> None:
+        """Learn from one specialist per robot, in the order of the environment's robots, too."""
+        self.alg.imitate(SpecialistBank([actor.to(self.device) for actor in specialists]), method)
+
+    # --- checkpoints ------------------------------------------------------------------------------------------------
+
+    def save(self, stage_end: bool = False) -> Path | None:
+        """Write a checkpoint and return its path; None in processes that do not write.
+
+        A checkpoint of this iteration that exists already is kept, unless it is now to be marked as a stage's end.
+        """
+        state = self._state()
+        if self.folder is None or (self._saved_iteration == self.current_learning_iteration and not stage_end):
+            return None
+        self._require_finite_parameters()
+        folder = self.folder / "checkpoints"
+        try:
+            path = ckpt.save_checkpoint(
+                folder,
+                state,
+                self.provenance,
+                iteration=self.current_learning_iteration,
+                env_steps=self.env_steps,
+                score=self._score,
+                stage_end=stage_end,
+            )
+            ckpt.prune_checkpoints(folder, self.cfg["keep_checkpoints"])
+        except OSError as error:
+            raise CheckpointError(f"{folder}: the checkpoint could not be written: {error}.") from error
+        self._saved_iteration = self.current_learning_iteration
+        return path
+
+    def load(self, path: Path | str, *, allow_drift: bool = False) -> None:
+        """Go on exactly where a checkpoint was written; nothing changes unless all of it fits.
+
+        With ``allow_drift`` a run goes on although configuration, robots or versions have changed, and is marked.
+        """
+        checkpoint = ckpt.load_checkpoint(Path(path), self.provenance.slot_table_hash)
+        changes = self.provenance.differences(checkpoint.manifest)
+        if changes and not allow_drift:
+            listed = "\n  ".join(changes)
+            raise CheckpointError(
+                f"{checkpoint.path}: cannot be resumed bit for bit, these have changed:\n  {listed}\n"
+                "Undo the changes, or go on with --allow-drift, which marks the run."
+            )
+        drifted = bool(changes) or checkpoint.manifest["drifted"]
+        self.provenance = dataclasses.replace(self.provenance, drifted=drifted)
+        self._load_state(checkpoint)
+
+    def load_weights(self, path: Path | str) -> None:
+        """Start from the policy and critic of a checkpoint; optimiser, counters and environment stay fresh."""
+        checkpoint = ckpt.load_checkpoint(Path(path), self.provenance.slot_table_hash)
+        self._require_same_shapes(checkpoint)
+        self.alg.load(checkpoint.state["algorithm"], {"actor": True, "critic": True})
+
+    def _state(self) -> dict[str, Any]:
+        """Everything a checkpoint holds; the part of each process is gathered in the first."""
+        local = {"env": self.env.state_dict(), "episodes": self.logger.episodes.state_dict(), "rng": self._rng_state()}
+        processes = [local]
+        if self.is_distributed:
+            processes = [{}] * self.gpu_world_size
+            torch.distributed.gather_object(local, processes if self.gpu_global_rank == 0 else None)
+        return {
+            "architecture": self.alg.actor.architecture,
+            "algorithm": self.alg.save(),
+            "runner": {
+                "next_iteration": self.current_learning_iteration,
+                "env_steps": self.env_steps,
+                "wall_time": self.wall_time,
+            },
+            "processes": processes,
+        }
+
+    def _load_state(self, checkpoint: ckpt.Checkpoint) -> None:
+        state = checkpoint.state
+        if len(state["processes"]) != self.gpu_world_size:
+            raise CheckpointError(
+                f"{checkpoint.path}: written by {len(state['processes'])} processes, resumed by {self.gpu_world_size}. "
+                "Resume with as many processes."
+            )
+        self._require_same_shapes(checkpoint)
+        local = state["processes"][self.gpu_global_rank]
+        self.env.load_state_dict(local["env"])
+        self.alg.load(state["algorithm"])
+        self.logger.episodes.load_state_dict(local["episodes"])
+        self.current_learning_iteration = self._saved_iteration = state["runner"]["next_iteration"]
+        self.env_steps = state["runner"]["env_steps"]
+        self.wall_time = state["runner"]["wall_time"]
+        self._score = checkpoint.manifest["score"]
+        torch.set_rng_state(local["rng"]["cpu"])
+        if "cuda" in local["rng"]:
+            torch.cuda.set_rng_state(local["rng"]["cuda"], self.device)
+
+    def _rng_state(self) -> dict[str, torch.Tensor]:
+        cuda = {"cuda": torch.cuda.get_rng_state(self.device)} if str(self.device).startswith("cuda") else {}
+        return {"cpu": torch.get_rng_state()} | cuda
+
+    def _save_now_and_then(self, scalars: dict[str, float]) -> None:
+        """Save every ``save_interval`` iterations; where that fails, training goes on and says so."""
+        self._score = scalars.get("Train/mean_reward")
+        if self.current_learning_iteration % self.cfg["save_interval"] == 0:
+            try:
+                self.save()
+            except CheckpointError as error:
+                self.logger.warn(f"{error} Training goes on; the last good checkpoint stays.")
+
+    def _require_same_shapes(self, checkpoint: ckpt.Checkpoint) -> None:
+        """Refuse weights that do not fit, before any is changed."""
+        for name, model in (("actor", self.alg.actor), ("critic", self.alg.critic)):
+            own = {key: tuple(x.shape) for key, x in model.state_dict().items()}
+            saved = {key: tuple(x.shape) for key, x in checkpoint.state["algorithm"][f"{name}_state_dict"].items()}
+            wrong = [f"{k}: {saved.get(k)}, expected {own.get(k)}" for k in own | saved if own.get(k) != saved.get(k)]
+            if wrong:
+                raise CheckpointError(
+                    f"{checkpoint.path}: its {name} has other shapes than this experiment's:\n  "
+                    + "\n  ".join(wrong)
+                    + "\nUse the algo.network and task.observations it was trained with."
+                )
+
+    def _require_finite_parameters(self) -> None:
+        for model in (self.alg.actor, self.alg.critic):
+            for name, parameter in model.named_parameters():
+                if not torch.isfinite(parameter).all():
+                    raise HealthError(f"Parameter {name} is not finite; it is not saved. Resume the last checkpoint.")
+
+    # --- data-parallel processes ------------------------------------------------------------------------------------
+
+    def _any_process(self, flag: bool) -> bool:
+        """Whether ``flag`` is set in any process, so that all of them stop after the same iteration."""
+        if not self.is_distributed:
+            return flag
+        votes = torch.tensor(float(flag), device=self.device)
+        torch.distributed.all_reduce(votes)
+        return bool(votes > 0)
+
+    def _configure_multi_gpu(self) -> None:
+        """Join the processes torchrun started: gloo on the CPU, which rsl_rl refuses, nccl on GPUs."""
+        self.gpu_world_size = int(os.getenv("WORLD_SIZE", "1"))
+        self.gpu_global_rank = int(os.getenv("RANK", "0"))
+        self.gpu_local_rank = int(os.getenv("LOCAL_RANK", "0"))
+        self.is_distributed = self.gpu_world_size > 1
+        self.cfg["multi_gpu"] = None
+        if not self.is_distributed:
+            return
+        self.cfg["multi_gpu"] = {
+            "global_rank": self.gpu_global_rank,
+            "local_rank": self.gpu_local_rank,
+            "world_size": self.gpu_world_size,
+        }
+        on_gpu = str(self.device).startswith("cuda")
+        if on_gpu:
+            torch.cuda.set_device(self.device)
+        if not torch.distributed.is_initialized():
+            torch.distributed.init_process_group("nccl" if on_gpu else "gloo")

@@ -1,0 +1,57 @@
+"""One line that says how far a run is."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from types import TracebackType
+from typing import Self
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+LINE_INTERVAL_S = 10.0
+"""Time between plain lines where the output is not a terminal [s]."""
+
+
+class ProgressReport:
+    """A progress bar with time left on a terminal, a plain line every ten seconds elsewhere."""
+
+    def __init__(self, title: str, first: int, last: int, console: Console | None = None) -> None:
+        """Report on iterations ``first`` to ``last``."""
+        self._title = title
+        self._first, self._last = first, last
+        self._console = console or Console(stderr=True)
+        self._start = self._last_line = time.monotonic()
+        self._bar: Progress | None = None
+
+    def __enter__(self) -> Self:
+        """Draw the bar."""
+        if self._console.is_terminal:
+            columns = (TextColumn("{task.description}"), BarColumn(None), TimeElapsedColumn(), TimeRemainingColumn())
+            self._bar = Progress(*columns, console=self._console)
+            self._bar.start()
+            self._task = self._bar.add_task(self._title, total=self._last, completed=self._first)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        """Leave the last state standing."""
+        if self._bar is not None:
+            self._bar.stop()
+
+    def update(self, iteration: int, env_steps: int, scalars: Mapping[str, float]) -> None:
+        """Report a finished iteration."""
+        reward = scalars.get("Train/mean_reward", float("nan"))
+        length = scalars.get("Train/mean_episode_length", float("nan"))
+        text = (
+            f"{self._title} {iteration}/{self._last} | {env_steps / 1e6:.2f}M steps "
+            f"| {scalars['Perf/total_fps']:.0f}/s | reward {reward:.2f} | length {length:.0f}"
+        )
+        if self._bar is not None:
+            self._bar.update(self._task, completed=iteration, description=text)
+        elif time.monotonic() - self._last_line >= LINE_INTERVAL_S or iteration == self._last:
+            self._last_line = time.monotonic()
+            left = (self._last_line - self._start) / (iteration - self._first) * (self._last - iteration)
+            self._console.print(f"{text} | {left / 60:.1f} min left", soft_wrap=True, highlight=False)

@@ -1,0 +1,398 @@
+"""The task: several robots, one pool, one rsl_rl ``VecEnv``. The order of a step is written here and nowhere else."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, fields
+from typing import Any
+
+import torch
+from rsl_rl.env import VecEnv
+from tensordict import TensorDict
+from torch import Tensor
+
+from eagle_rl.config.schema import TaskCfg
+
+from .geometry import rotate_inverse
+from .mdp.aids import LearningAids, harness_damping, harness_wrench
+from .mdp.commands import CommandSampler
+from .mdp.curriculum import penalty_scale
+from .mdp.gait import advance_phase, clock, contact_probability, foot_phases
+from .mdp.metrics import tracking_errors
+from .mdp.observations import (
+    History,
+    ObservationLayout,
+    command_observation,
+    critic_observation,
+    delay,
+    estimation_target,
+    noise_scale,
+    proprioception,
+)
+from .mdp.randomization import Randomizer
+from .mdp.rewards import RewardContext, compute_rewards, success_scores
+from .mdp.terminations import terminations
+from .pooling import pool_robots, share
+from .rng import CounterRng
+from .robots.embodiment import embodiment_dim, pooled_embodiment
+from .robots.model import build_model
+from .robots.sensors import SENSOR_SLICES
+from .robots.slots import NUM_SLOTS
+from .robots.spec import RobotSpec
+from .sim.batch import RobotBatch
+from .sim.pool import PhysicsPool
+from .state import PooledState
+from .step_log import StepLog, episode_ratio
+
+LOG_INTERVAL = 24
+"""Control steps between entries in ``extras["log"]``."""
+
+
+class HumanoidEnv(VecEnv):
+    """Whole-body command tracking by a mixed fleet of humanoids.
+
+    Actions, observations, rewards and terminations are computed once over the pool, in slot space.
+    """
+
+    num_actions = NUM_SLOTS
+
+    def __init__(
+        self,
+        task: TaskCfg,
+        robots: Sequence[RobotSpec],
+        num_envs: int,
+        seed: int,
+        device: str = "cpu",
+        num_threads: int = 0,
+        dtype: torch.dtype = torch.float32,
+    ) -> None:
+        """Build the pool and reset every environment.
+
+        Args:
+            task: the Markov decision process.
+            robots: the fleet; environments are shared equally, a remainder goes to the first robots.
+            num_envs: environments over all robots, N.
+            seed: root of every random stream.
+            device: where everything but the physics lives.
+            num_threads: physics threads, 0 for one per core.
+            dtype: precision of the pooled state; observations are always float32.
+        """
+        self.task = task
+        self.num_envs = num_envs
+        self.device = torch.device(device)
+        self.cfg = asdict(task)
+        self.step_dt = task.sim.physics_dt * task.sim.decimation
+        self.max_episode_length = round(task.terminations.episode_length_s / self.step_dt)
+        self.robot_names = [spec.name for spec in robots]
+        counts = share(num_envs, len(robots))
+        batches = [
+            RobotBatch(spec, build_model(spec, task.sim), count, task.sim.decimation, num_threads)
+            for spec, count in zip(robots, counts, strict=True)
+        ]
+        self.pool = PhysicsPool(batches, self.device, dtype)
+        self.robots = pool_robots(robots, counts, task.control, task.rewards, self.device, dtype)
+        self.rng = CounterRng(
+            seed,
+            [name for name, count in zip(self.robot_names, counts, strict=True) for _ in range(count)],
+            torch.cat([torch.arange(count) for count in counts]).to(self.device),
+        )
+        self.randomizer = Randomizer(task.randomization, self.pool, self.robots, self.rng)
+        self.commands = CommandSampler(task.commands, self.robots, len(robots), self.rng, self.step_dt)
+        self.aids = LearningAids(task.aids, len(robots), self.device)
+        observations = task.observations
+        self.embodiment = (
+            pooled_embodiment(robots, self.robots.robot_id, self.randomizer.bodies, observations.descriptor)
+            if observations.embodiment_observation
+            else None
+        )
+        self.layout = ObservationLayout(
+            observations, embodiment_dim(observations.descriptor) if self.embodiment is not None else 0
+        )
+        self.mirror = self.layout.mirror(self.device)
+        self._noise = noise_scale(observations, self.robots)
+        self._log = StepLog(self.robot_names, self.robots.robot_id)
+        self._all = torch.arange(num_envs, device=self.device)
+        self._pinned: Tensor | None = None
+        self._allocate(dtype)
+        self._set_harness_damping()
+        self._reset(self._all)
+
+    def _allocate(self, dtype: torch.dtype) -> None:
+        """Buffers that outlive a step."""
+        n, device = self.num_envs, self.device
+        self.common_step_counter = 0
+        self.episode_length_buf = torch.zeros(n, dtype=torch.long, device=device)
+        self.episode_count = torch.zeros(n, dtype=torch.long, device=device)
+        self.step_count = torch.zeros(n, dtype=torch.long, device=device)
+        self.command_count = torch.zeros(n, dtype=torch.long, device=device)
+        self.phase = torch.zeros(n, dtype=dtype, device=device)
+        self.command = torch.zeros(n, 5, dtype=dtype, device=device)
+        self.standing = torch.zeros(n, dtype=torch.bool, device=device)
+        zeros = torch.zeros(n, NUM_SLOTS, dtype=dtype, device=device)
+        self._actions, self._last_actions, self._last_last_actions = zeros, zeros, zeros
+        self._last_joint_vel = zeros
+        self._last_contact = torch.zeros(n, 2, dtype=torch.bool, device=device)
+        self.state = self._derive(self.pool.staged())
+        frame = proprioception(self.state, self.robots, self.task.observations)
+        self._last_frame = frame
+        self.history = History(n, self.task.observations.history_length, frame)
+
+    # --- the step -----------------------------------------------------------------------------------------------------
+
+    def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
+        """Advance one control step.
+
+        Args:
+            actions: policy output in slots, shape (N, 32); absent slots are ignored.
+
+        Returns:
+            Observations after resets, rewards (N,), dones (N,), and extras with ``time_outs``, ``log``, and the true
+            last observations of the environments that timed out (``final_ids``, ``final_observations``).
+        """
+        clip = self.task.control.action_clip
+        self._last_last_actions, self._last_actions = self._last_actions, self._actions
+        self._actions = actions.to(self._actions.dtype).clamp(-clip, clip) * self.robots.slot_mask
+        self.randomizer.push(self.step_count, self.penalty_scale, self.step_dt)
+        targets = self.robots.default_joint_pos + self.robots.action_scale * self._actions + self.randomizer.motor_offset
+        staged = self.pool.step(targets, self._harness())
+        self.common_step_counter += 1
+        self.episode_length_buf = self.episode_length_buf + 1
+        self.step_count += 1
+        self.phase = advance_phase(self.phase, self.step_dt, self.task.gait)
+
+        sick = self.pool.faults()
+        self.state = self._derive(staged)
+        reasons = terminations(self.state, self.task.terminations)
+        terminated = torch.stack([*reasons.values(), sick]).any(dim=0)
+        time_outs = (self.episode_length_buf >= self.max_episode_length) & ~terminated
+        dones = terminated | time_outs
+        rewards, terms = self._rewards(terminated)
+        rewards = torch.where(sick, torch.zeros_like(rewards), rewards)
+
+        self._observe()
+        final_ids = time_outs.nonzero().squeeze(1)
+        extras: dict[str, Any] = {"time_outs": time_outs, "final_ids": final_ids}
+        extras["final_observations"] = self._groups(final_ids)
+        extras["log"] = self._account(terms, reasons | {"sick": sick}, dones, time_outs)
+        reset_ids = dones.nonzero().squeeze(1)
+        if len(reset_ids):
+            self._reset(reset_ids)
+        self._resample()
+        return self._groups(None), rewards.float(), dones, extras
+
+    def get_observations(self) -> TensorDict:
+        """Observation groups at the present state, fresh tensors."""
+        return self._groups(None)
+
+    def tracking_errors(self) -> Tensor:
+        """Absolute error of each command at the last step [m/s, m/s, rad/s, m, rad], shape (N, 5)."""
+        return tracking_errors(self.state, self.robots)
+
+    def pin_commands(self, command: Tensor | None) -> None:
+        """Hold these commands, shape (N, 5), instead of sampling; ``None`` returns to sampling at the next draw."""
+        self._pinned = command
+        if command is not None:
+            self._set_commands(self._all, command.to(self.command))
+
+    @property
+    def penalty_scale(self) -> float:
+        """k, the factor on the penalties of the curriculum (HugWBC 4)."""
+        return penalty_scale(self.task.rewards, self.common_step_counter)
+
+    # --- parts of the step --------------------------------------------------------------------------------------------
+
+    def _harness(self) -> Tensor | None:
+        """Wrench of the virtual harness, or None once it is off for every robot."""
+        if not self.aids.harness.any():
+            return None
+        return harness_wrench(self.state, self.robots, self.aids.harness[self.robots.robot_id].to(self.command.dtype))
+
+    def _set_harness_damping(self) -> None:
+        """Put the harness' share of the damping in force; it changes only when the aids do."""
+        if self.task.aids.harness > 0:
+            scale = self.aids.harness[self.robots.robot_id].to(self.command.dtype)
+            self.pool.set_base_damping(harness_damping(self.robots, scale))
+
+    def _derive(self, staged: Tensor, ids: Tensor | None = None) -> PooledState:
+        """Turn staging rows into the pooled state, with the command, phase and actions now in force."""
+        columns = self.pool.columns
+        sensors = staged[:, columns["sensors"]]
+        quat = staged[:, columns["root_quat"]]
+        joint_vel = staged[:, columns["joint_vel"]]
+        down = quat.new_tensor([0.0, 0.0, -1.0]).expand(len(quat), 3)
+
+        def of(buffer: Tensor) -> Tensor:
+            return buffer if ids is None else buffer[ids]
+
+        def sensor(name: str, *shape: int) -> Tensor:
+            return sensors[:, SENSOR_SLICES[name]].reshape(-1, *shape)
+
+        last_joint_vel = of(self._last_joint_vel)
+        foot_pos = sensor("sole_pos", 2, 3)
+        root_pos = staged[:, columns["root_pos"]]
+        return PooledState(
+            root_pos_w=root_pos,
+            root_quat_w=quat,
+            base_lin_vel_b=rotate_inverse(quat, staged[:, columns["root_lin_vel_w"]]),
+            base_ang_vel_b=staged[:, columns["base_ang_vel_b"]],
+            projected_gravity_b=rotate_inverse(quat, down),
+            base_height=root_pos[:, 2],
+            joint_pos=staged[:, columns["joint_pos"]],
+            joint_vel=joint_vel,
+            joint_acc=(joint_vel - last_joint_vel) / self.step_dt,
+            joint_torque=staged[:, columns["joint_torque"]],
+            foot_pos_w=foot_pos,
+            foot_vel_w=sensor("sole_vel", 2, 3),
+            foot_force_w=sensor("foot_force", 2, 3),
+            foot_height=foot_pos[..., 2],
+            last_foot_contact=of(self._last_contact),
+            link_force_w=sensor("contact_force", 7, 3),
+            ground_contact=sensor("floor_contact", 3).gt(0).any(dim=1),
+            height_scan=staged.new_zeros(len(staged), self.layout.num_scan_points),
+            friction=of(self.randomizer.friction),
+            command=of(self.command),
+            standing=of(self.standing),
+            foot_phase=foot_phases(of(self.phase), of(self.standing), self.task.gait),
+            actions=of(self._actions),
+            last_actions=of(self._last_actions),
+            last_last_actions=of(self._last_last_actions),
+        )
+
+    def _rewards(self, terminated: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """Rewards of the step; also advances what the next step compares itself with."""
+        context = RewardContext(
+            cfg=self.task.rewards,
+            gait=self.task.gait,
+            gait_shaping=self.aids.gait_shaping[self.robots.robot_id].to(self.command.dtype),
+            terminated=terminated,
+        )
+        rewards, terms = compute_rewards(self.state, self.robots, context, self.penalty_scale, self.step_dt)
+        self._last_joint_vel = self.state.joint_vel
+        self._last_contact = self.state.foot_contact
+        if self._pinned is None:
+            self.commands.accumulate(*success_scores(self.state, self.robots, context))
+        return rewards, terms
+
+    def _observe(self) -> None:
+        """Push the frame of the present state, delayed and corrupted, into the history."""
+        cfg = self.task.observations
+        frame = proprioception(self.state, self.robots, cfg)
+        sensed = delay(frame, self._last_frame, self.randomizer.latency)
+        if cfg.enable_corruption:
+            noise = self.rng.uniform("observation_noise", self.step_count, frame.shape[1])
+            sensed = sensed + (2.0 * noise - 1.0).to(frame.dtype) * self._noise
+        self._last_frame = frame
+        self.history.push(sensed)
+
+    def _groups(self, ids: Tensor | None) -> TensorDict:
+        """Observation groups of some environments (None: all) at the present state."""
+        cfg = self.task.observations
+        state = self.state if ids is None else self.state.rows(ids)
+        robots = self.robots if ids is None else self.robots.rows(ids)
+        embodiment = self.embodiment if ids is None or self.embodiment is None else self.embodiment[ids]
+        frames = self.history.frames if ids is None else self.history.frames[ids]
+        groups = {
+            "history": frames.flatten(1),
+            "command": command_observation(state, cfg),
+            "clock": clock(state.foot_phase),
+            "critic": critic_observation(state, robots, embodiment, cfg, self.task.randomization.friction),
+            "estimate": estimation_target(state, embodiment, cfg),
+            "slot_mask": robots.slot_mask,
+        }
+        tensors = {name: value.float() for name, value in groups.items()}
+        return TensorDict(tensors | {"robot": robots.robot_id}, batch_size=[len(state.command)])
+
+    def _reset(self, ids: Tensor) -> None:
+        """Start new episodes; other environments are untouched, bit for bit."""
+        self.randomizer.reset(ids, self.episode_count[ids], self.step_dt)
+        root, joint_pos, joint_vel = self.randomizer.initial_state(ids, self.episode_count[ids])
+        staged = self.pool.reset(ids, root, joint_pos, joint_vel)
+        self.episode_count[ids] += 1
+        self.episode_length_buf = self.episode_length_buf.index_fill(0, ids, 0)
+        self.phase = self.phase.index_fill(0, ids, 0.0)
+        self._draw_commands(ids)
+        for name in ("_actions", "_last_actions", "_last_last_actions", "_last_contact"):
+            setattr(self, name, getattr(self, name).index_fill(0, ids, 0))
+        self._last_joint_vel = self._last_joint_vel.index_copy(0, ids, staged[:, self.pool.columns["joint_vel"]])
+        self._write_rows(ids, self._derive(staged, ids))
+        frame = proprioception(self.state.rows(ids), self.robots.rows(ids), self.task.observations)
+        self._last_frame = self._last_frame.index_copy(0, ids, frame)
+        self.history.reset(ids, frame)
+
+    def _write_rows(self, ids: Tensor, rows: PooledState) -> None:
+        """Replace some rows of the state by new tensors, so that earlier observations keep theirs."""
+        self.state = PooledState(
+            **{f.name: getattr(self.state, f.name).index_copy(0, ids, getattr(rows, f.name)) for f in fields(rows)}
+        )
+
+    def _resample(self) -> None:
+        """Draw new commands where their time is up."""
+        interval = round(self.task.commands.resampling_time_s / self.step_dt)
+        ids = ((self.episode_length_buf % interval == 0) & (self.episode_length_buf > 0)).nonzero().squeeze(1)
+        if len(ids):
+            self._draw_commands(ids)
+            self.state.command, self.state.standing = self.command, self.standing
+            self.state.foot_phase = foot_phases(self.phase, self.standing, self.task.gait)
+
+    def _draw_commands(self, ids: Tensor) -> None:
+        if self._pinned is not None:
+            self._set_commands(ids, self._pinned[ids].to(self.command))
+            return
+        command, _ = self.commands.sample(ids, self.command_count[ids])
+        self.command_count[ids] += 1
+        self._set_commands(ids, command)
+
+    def _set_commands(self, ids: Tensor, command: Tensor) -> None:
+        """Put commands in force; standing means all three velocities are zero (HugWBC 1)."""
+        self.command = self.command.index_copy(0, ids, command.to(self.command.dtype))
+        self.standing = (self.command[:, :3] == 0).all(dim=1)
+
+    def _account(
+        self, terms: dict[str, Tensor], reasons: dict[str, Tensor], dones: Tensor, time_outs: Tensor
+    ) -> dict[str, Tensor]:
+        """Add the step to the log and the aids; returns tags and values once per ``LOG_INTERVAL``."""
+        stance = contact_probability(self.state.foot_phase, self.task.gait) > 0.5
+        match = (self.state.foot_contact == stance).to(self.command.dtype).mean(dim=1)
+        self._log.add(terms, reasons, self.tracking_errors(), match, dones & ~time_outs, dones, self.state.standing)
+        if self.common_step_counter % LOG_INTERVAL:
+            return {}
+        entry, falls_per_step, contact_match = self._log.flush()
+        self.aids.update(episode_ratio(falls_per_step, self.max_episode_length), contact_match)
+        self._set_harness_damping()
+        k = torch.tensor(self.penalty_scale)
+        return entry | self.commands.log() | self.aids.log(self.robot_names) | {"Curriculum/penalty_scale": k}
+
+    # --- exact resume -------------------------------------------------------------------------------------------------
+
+    _BUFFERS = (
+        "episode_length_buf episode_count step_count command_count phase command standing _actions _last_actions "
+        "_last_last_actions _last_joint_vel _last_contact _last_frame"
+    ).split()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything a resumed run needs to go on bit for bit (tensors and numbers only)."""
+        return {
+            "common_step_counter": self.common_step_counter,
+            "buffers": {name: getattr(self, name).clone() for name in self._BUFFERS},
+            "state": {f.name: getattr(self.state, f.name).clone() for f in fields(self.state)},
+            "history": self.history.frames.clone(),
+            "pool": self.pool.state_dict(),
+            "randomizer": self.randomizer.state_dict(),
+            "commands": self.commands.state_dict(),
+            "aids": self.aids.state_dict(),
+            "log": self._log.state_dict(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`state_dict` returned, in an environment built from the same configuration and seed."""
+        self.common_step_counter = state["common_step_counter"]
+        for name, value in state["buffers"].items():
+            setattr(self, name, value.to(self.device))
+        self.state = PooledState(**{name: value.to(self.device) for name, value in state["state"].items()})
+        self.history.frames = state["history"].to(self.device)
+        self.randomizer.load_state_dict(state["randomizer"])
+        self.pool.load_state_dict(state["pool"])
+        self.commands.load_state_dict(state["commands"])
+        self.aids.load_state_dict(state["aids"])
+        self._set_harness_damping()
+        self._log.load_state_dict(state["log"])

@@ -1,0 +1,137 @@
+"""Learning aids, annealed to exactly zero: a virtual harness on the base, and a softer gait reward (ours).
+
+Both have one scale per robot that decays while the robot no longer needs it. Evaluation runs without either.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from eagle_rl.config.schema import AidsCfg
+
+from ..geometry import rotate_yaw, yaw_of
+from ..state import PooledRobots, PooledState
+
+_SMOOTHING = 0.05
+"""Share of the newest interval in the running means that decide about decay [-]; few environments make it noisy."""
+_SNAP = 0.01
+"""Scale under which an aid is off [-]."""
+_GRAVITY = 9.81
+
+# The harness, per kilogram of robot; a robot topples with about m g h = 7 N m/rad/kg.
+_TILT_STIFFNESS = 400.0 / 33.0
+"""[N m/rad/kg]"""
+_MAX_TILT_TORQUE = 120.0 / 33.0
+"""[N m/kg]"""
+_TILT_DAMPING = 12.0 / 33.0
+"""[N m s/rad/kg]; part of the physics step and so implicit: as a torque held over a control step it would shake a light
+pelvis apart."""
+_HEIGHT_STIFFNESS = 50.0
+"""[N/m/kg]: full support 0.1 m below the commanded height."""
+_MAX_SUPPORT = 0.5
+"""Share of the weight the harness carries at most [-]."""
+_DRAG = 1.0
+"""[N s/m/kg]"""
+_MAX_DRAG = 0.15
+"""Bound on the drag as a share of the weight [-]."""
+
+
+class LearningAids:
+    """Scales of both aids, one per robot."""
+
+    _STATE = ("harness", "gait_shaping", "_episode_ratio", "_contact_match")
+
+    def __init__(self, cfg: AidsCfg, num_robots: int, device: torch.device | str = "cpu") -> None:
+        """Start both aids at their configured scales."""
+        self.cfg = cfg
+        self.harness = torch.full((num_robots,), cfg.harness, dtype=torch.float64, device=device)
+        """Scale of the harness, shape (R,)."""
+        self.gait_shaping = torch.full((num_robots,), cfg.gait_shaping, dtype=torch.float64, device=device)
+        """Scale s of gait shaping, shape (R,)."""
+        self._episode_ratio = torch.zeros_like(self.harness)
+        self._contact_match = torch.zeros_like(self.harness)
+
+    def update(self, episode_ratio: Tensor, contact_match: Tensor) -> None:
+        """Decay what is no longer needed; call once per ``interval_steps``.
+
+        Args:
+            episode_ratio: mean episode length of each robot over the full length, shape (R,).
+            contact_match: share of steps in which its feet agree with the clock, shape (R,).
+        """
+        cfg = self.cfg
+        self._episode_ratio = torch.lerp(self._episode_ratio, episode_ratio.to(self._episode_ratio), _SMOOTHING)
+        self._contact_match = torch.lerp(self._contact_match, contact_match.to(self._contact_match), _SMOOTHING)
+        stands, walks = self._episode_ratio >= cfg.min_episode_ratio, self._contact_match >= cfg.min_contact_match
+        self.harness = _decayed(self.harness, stands, cfg.harness_decay)
+        self.gait_shaping = _decayed(self.gait_shaping, walks, cfg.gait_shaping_decay)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Both scales and the running means that decide about their decay."""
+        return {name: getattr(self, name).clone() for name in self._STATE}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Restore what :meth:`state_dict` returned."""
+        for name in self._STATE:
+            setattr(self, name, state[name].to(self.harness))
+
+    def log(self, robot_names: Sequence[str]) -> dict[str, float]:
+        """Both scales of every robot."""
+        scales = {"harness": self.harness.tolist(), "gait_shaping": self.gait_shaping.tolist()}
+        return {
+            f"Curriculum/{aid}/{name}": value
+            for aid, values in scales.items()
+            for name, value in zip(robot_names, values, strict=True)
+        }
+
+
+def _decayed(scale: Tensor, fulfilled: Tensor, decay: float) -> Tensor:
+    """Scale one update later: smaller where the condition holds, exactly zero once it is negligible."""
+    scale = torch.where(fulfilled, scale * (1.0 - decay), scale)
+    return torch.where(scale < _SNAP, 0.0, scale)
+
+
+def _bounded(x: Tensor, bound: Tensor) -> Tensor:
+    return torch.maximum(torch.minimum(x, bound), -bound)
+
+
+def _tilt_torque(state: PooledState, mass: Tensor) -> Tensor:
+    """Torque toward zero roll and the commanded pitch in the yaw frame [N m], shape (N, 2)."""
+    error = torch.stack((state.base_roll, state.base_pitch - state.command[:, 4]), dim=1)
+    return _bounded(-_TILT_STIFFNESS * mass * error, _MAX_TILT_TORQUE * mass)
+
+
+def _force(state: PooledState, robots: PooledRobots, mass: Tensor) -> Tensor:
+    """Drag toward the commanded velocity and support toward the commanded height in the yaw frame [N], (N, 3)."""
+    drag = _DRAG * mass * (state.command[:, :2] - state.base_lin_vel_b[:, :2])
+    drag = _bounded(drag, _MAX_DRAG * _GRAVITY * mass)
+    sag = (robots.nominal_height + state.command[:, 3] - state.base_height).unsqueeze(1)
+    support = torch.minimum(_HEIGHT_STIFFNESS * mass * sag, _MAX_SUPPORT * _GRAVITY * mass).clamp(min=0.0)
+    return torch.cat((drag, support), dim=1)
+
+
+def harness_wrench(state: PooledState, robots: PooledRobots, scale: Tensor) -> Tensor:
+    """Help of the virtual harness: upright as commanded, carried by at most half the weight, mildly dragged along.
+
+    Args:
+        state: state before the control step.
+        robots: constants of each environment's robot.
+        scale: strength in [0, 1], shape (N,).
+
+    Returns:
+        World-frame force [N] and torque [N m] on the base, shape (N, 6); exactly zero where the scale is.
+    """
+    mass = robots.total_mass.unsqueeze(1)
+    tilt = _tilt_torque(state, mass)
+    torque = torch.cat((tilt, torch.zeros_like(tilt[:, :1])), dim=1)
+    yaw = yaw_of(state.root_quat_w).unsqueeze(1)
+    wrench = rotate_yaw(yaw, torch.stack((_force(state, robots, mass), torque), dim=1)).flatten(1)
+    scale = scale.to(wrench.dtype).unsqueeze(1)
+    return torch.where(scale > 0.0, wrench * scale, 0.0)
+
+
+def harness_damping(robots: PooledRobots, scale: Tensor) -> Tensor:
+    """Damping of the bases' rotation by the harness [N m s/rad], shape (N,)."""
+    return _TILT_DAMPING * robots.total_mass * scale

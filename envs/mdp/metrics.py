@@ -1,0 +1,59 @@
+"""Tracking errors of the paper's main table, and what a robot that ignores its command would score."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from eagle_rl.config.schema import CommandsCfg, GaitCfg, Range
+
+from ..state import PooledRobots, PooledState
+from .gait import contact_probability
+
+ERROR_NAMES = ("lin_vel_x", "lin_vel_y", "ang_vel_z", "base_height", "body_pitch")
+"""Columns of every array of tracking errors: E_vx, E_vy, E_omega, E_h, E_p; also the fields of ``CommandsCfg``."""
+
+
+def tracking_errors(state: PooledState, robots: PooledRobots) -> Tensor:
+    """Absolute error of each command, shape (N, 5): [m/s], [m/s], [rad/s], [m], [rad] (paper, Tab. main).
+
+    Velocities are true ones in the base frame, height and pitch those of the root (HugWBC 10, 11.5).
+    """
+    measured = torch.stack(
+        (
+            state.base_lin_vel_b[:, 0],
+            state.base_lin_vel_b[:, 1],
+            state.base_ang_vel_b[:, 2],
+            state.base_height - robots.nominal_height,
+            state.base_pitch,
+        ),
+        dim=1,
+    )
+    return (state.command - measured).abs()
+
+
+def contact_match(state: PooledState, cfg: GaitCfg) -> Tensor:
+    """Share of the feet whose contact agrees with the clock (C > 0.5), shape (N,)."""
+    desired = contact_probability(state.foot_phase, cfg) > 0.5
+    return (desired == state.foot_contact).to(state.foot_phase.dtype).mean(dim=1)
+
+
+def _mean_abs(low: float, high: float) -> float:
+    """Mean of |x| for x uniform in [low, high]."""
+    if low >= 0.0 or high <= 0.0:
+        return abs(low + high) / 2.0
+    return (low**2 + high**2) / (2.0 * (high - low))
+
+
+def _finishing_ranges(cfg: CommandsCfg) -> list[Range]:
+    return [getattr(cfg, name).finishing for name in ERROR_NAMES]
+
+
+def floor_stand_still(cfg: CommandsCfg) -> tuple[float, ...]:
+    """Errors of a robot that stands upright at its nominal height whatever it is told, in the order of ERROR_NAMES."""
+    return tuple(_mean_abs(low, high) for low, high in _finishing_ranges(cfg))
+
+
+def floor_best_constant(cfg: CommandsCfg) -> tuple[float, ...]:
+    """Errors of a robot that holds the middle of each finishing range whatever it is told."""
+    return tuple((high - low) / 4.0 for low, high in _finishing_ranges(cfg))

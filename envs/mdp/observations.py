@@ -1,0 +1,162 @@
+"""What actor and critic see, computed once over the pool (paper, Sec. Embodiment-aware Observation; HugWBC 5).
+
+Columns, units and scales are those of ``envs.mdp.layout``; this file only gathers quantities in that order.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from eagle_rl.config.schema import ObservationsCfg, Range
+
+from ..geometry import rotate_yaw, yaw_of
+from ..state import PooledRobots, PooledState
+from .gait import clock
+from .layout import EMBODIMENT_DIM, REFERENCE_MASS, SENSED_SIZE, ObservationLayout, scale_vector, scan_points
+
+__all__ = [
+    "EMBODIMENT_DIM",
+    "History",
+    "ObservationLayout",
+    "command_observation",
+    "critic_observation",
+    "delay",
+    "estimation_target",
+    "noise_scale",
+    "proprioception",
+    "scan_points",
+]
+
+COLLISION_FORCE = 2.0
+"""Contact force above which a link counts as in collision [N] (HugWBC 5)."""
+
+
+def _scaled(columns: list[Tensor], cfg: ObservationsCfg, group: str) -> Tensor:
+    """Lay columns side by side, scale and bound them."""
+    x = torch.cat(columns, dim=1)
+    scale = scale_vector(cfg, group, x.dtype, x.device)[: x.shape[1]]
+    x[:, : len(scale)] *= scale
+    return x.clamp_(-cfg.clip, cfg.clip)
+
+
+def _frame_columns(state: PooledState, robots: PooledRobots, cfg: ObservationsCfg) -> list[Tensor]:
+    joint_pos_rel = (state.joint_pos - robots.default_joint_pos) * robots.slot_mask
+    columns = [state.base_ang_vel_b, state.projected_gravity_b, joint_pos_rel, state.joint_vel]
+    return [*columns, state.actions] if cfg.last_action else columns
+
+
+def proprioception(state: PooledState, robots: PooledRobots, cfg: ObservationsCfg) -> Tensor:
+    """One clean, scaled frame o^prio: angular velocity, gravity, joint positions and velocities, last action.
+
+    Returns:
+        Shape (N, F), F = 102 with the last action, else 70; zero in absent slots.
+    """
+    return _scaled(_frame_columns(state, robots, cfg), cfg, "history")
+
+
+def noise_scale(cfg: ObservationsCfg, robots: PooledRobots) -> Tensor:
+    """Half widths of the uniform noise on a scaled frame, shape (N, F); zero in absent slots and on actions."""
+    noise, mask = cfg.noise, robots.slot_mask
+    three = mask.new_ones(mask.shape[0], 3)
+    columns = [
+        noise.base_ang_vel * three,
+        noise.projected_gravity * three,
+        noise.joint_pos * mask,
+        noise.joint_vel * mask,
+    ]
+    if cfg.last_action:
+        columns.append(torch.zeros_like(mask))
+    frame = torch.cat(columns, dim=1) * float(cfg.enable_corruption)
+    return frame * scale_vector(cfg, "history", frame.dtype, frame.device)[: frame.shape[1]]
+
+
+def delay(current: Tensor, previous: Tensor, fraction: Tensor) -> Tensor:
+    """Frame seen through sensors that lag by a fraction of the control step (HugWBC 8).
+
+    Args:
+        current: newest frame, shape (N, F).
+        previous: the clean frame one step before, shape (N, F).
+        fraction: latency over control step, in [0, 1], shape (N, 1).
+
+    Returns:
+        The blend of both in the sensed columns, the newest frame in the last action's; shape (N, F).
+    """
+    sensed = torch.lerp(current[:, :SENSED_SIZE], previous[:, :SENSED_SIZE], fraction)
+    return torch.cat((sensed, current[:, SENSED_SIZE:]), dim=1)
+
+
+class History:
+    """The last K frames s_t, newest first."""
+
+    def __init__(self, num_envs: int, length: int, frame: Tensor) -> None:
+        """Start with zeros, as wide as ``frame`` of shape (..., F); call :meth:`reset` before use."""
+        self.frames = frame.new_zeros(num_envs, length, frame.shape[-1])
+        """Shape (N, K, F)."""
+
+    def push(self, frame: Tensor) -> None:
+        """Put a frame of shape (N, F) in front and drop the oldest; tensors handed out before keep their values."""
+        self.frames = torch.cat((frame.unsqueeze(1), self.frames[:, :-1]), dim=1)
+
+    def reset(self, ids: Tensor, frame: Tensor) -> None:
+        """Fill all K frames of some environments with their first frame, shapes (n,) and (n, F) (HugWBC 5)."""
+        self.frames[ids] = frame.unsqueeze(1).expand(-1, self.frames.shape[1], -1)
+
+    @property
+    def flat(self) -> Tensor:
+        """The observation group "history", shape (N, K * F)."""
+        return self.frames.flatten(1)
+
+
+def command_observation(state: PooledState, cfg: ObservationsCfg) -> Tensor:
+    """Scaled command c_t, shape (N, 5)."""
+    return _scaled([state.command], cfg, "command")
+
+
+def _friction_column(friction: Tensor, friction_range: Range) -> Tensor:
+    """Friction mapped from its range to [-1, 1], shape (N, 1); zero where the range is one number."""
+    low, high = friction_range
+    if high <= low:
+        return torch.zeros_like(friction).unsqueeze(1)
+    return ((friction - low) * (2.0 / (high - low)) - 1.0).unsqueeze(1)
+
+
+def _privileged_columns(state: PooledState, robots: PooledRobots, friction_range: Range) -> list[Tensor]:
+    height = state.base_height - robots.nominal_height
+    forces = rotate_yaw(-yaw_of(state.root_quat_w).unsqueeze(1), state.foot_force_w).flatten(1)
+    scan = height.unsqueeze(1) - state.height_scan
+    return [
+        state.base_lin_vel_b,
+        (height - state.command[:, 3]).clamp(-0.5, 0.5).unsqueeze(1),
+        state.foot_height.clamp(-1.0, 1.0),
+        forces * (REFERENCE_MASS / robots.total_mass).unsqueeze(1),
+        (torch.linalg.vector_norm(state.link_force_w, dim=2) > COLLISION_FORCE).to(scan.dtype),
+        _friction_column(state.friction, friction_range),
+        scan.clamp(-1.0, 1.0),
+    ]
+
+
+def critic_observation(
+    state: PooledState, robots: PooledRobots, embodiment: Tensor | None, cfg: ObservationsCfg, friction_range: Range
+) -> Tensor:
+    """What the critic sees, never corrupted: frame, command, clock and everything privileged (paper; HugWBC 5).
+
+    Args:
+        state: state after the step.
+        robots: constants of each environment's robot.
+        embodiment: standardised o_ea, shape (N, E), or None where it is off.
+        cfg: scales and bound.
+        friction_range: range of ``RandomizationCfg.friction``.
+
+    Returns:
+        Shape (N, C), columns as in ``ObservationLayout.groups["critic"]``.
+    """
+    columns = _frame_columns(state, robots, cfg)
+    columns += [state.command, clock(state.foot_phase), *_privileged_columns(state, robots, friction_range)]
+    return _scaled(columns if embodiment is None else [*columns, embodiment], cfg, "critic")
+
+
+def estimation_target(state: PooledState, embodiment: Tensor | None, cfg: ObservationsCfg) -> Tensor:
+    """What the actor's estimator is to recover: scaled base velocity and o_ea, shape (N, 3 + E)."""
+    columns = [state.base_lin_vel_b]
+    return _scaled(columns if embodiment is None else [*columns, embodiment], cfg, "estimate")

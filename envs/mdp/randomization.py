@@ -1,0 +1,142 @@
+"""Domain randomization, per environment and from named streams (HugWBC 8)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from eagle_rl.config.schema import RandomizationCfg
+
+from ..geometry import quat_from_yaw
+from ..rng import CounterRng
+from ..robots.embodiment import EMBODIMENT_LINKS, BodyChanges
+from ..robots.slots import NUM_SLOTS
+from ..sim.pool import PhysicsPool
+from ..state import PooledRobots
+
+NOMINAL_FRICTION = 1.0
+SPAWN_CLEARANCE = 0.04
+"""Height above the default pose at which a robot is spawned [m] (HugWBC 2)."""
+
+
+class Randomizer:
+    """Draws and applies every row of the randomization table; nominal values where a row is off."""
+
+    def __init__(self, cfg: RandomizationCfg, pool: PhysicsPool, robots: PooledRobots, rng: CounterRng) -> None:
+        """Draw the bodies of every environment; the rest follows at each reset."""
+        self.cfg = cfg
+        self._pool = pool
+        self._robots = robots
+        self._rng = rng
+        mass = robots.total_mass
+        num_envs = len(mass)
+        self.friction = torch.full_like(mass, NOMINAL_FRICTION)
+        """Friction coefficient, shape (N,)."""
+        self.motor_offset = mass.new_zeros(num_envs, NUM_SLOTS)
+        """Offset of the PD targets, canonical [rad], shape (N, 32)."""
+        self.latency = mass.new_zeros(num_envs, 1)
+        """Age of the proprioception as a share of the control step, shape (N, 1)."""
+        self._stiffness_scale = mass.new_ones(num_envs, NUM_SLOTS)
+        self._damping_scale = mass.new_ones(num_envs, NUM_SLOTS)
+        self.bodies = self._randomize_bodies()
+
+    def reset(self, ids: Tensor, count: Tensor, step_dt: float) -> None:
+        """Redraw what is redrawn at each reset for some environments, ``count`` being their episode numbers."""
+        if not self.cfg.enabled:
+            return
+        cfg, mask = self.cfg, self._robots.slot_mask[ids]
+
+        def draw(bounds: tuple[float, float], stream: str, size: int) -> Tensor:
+            return self._rng.uniform_in(*bounds, stream, count, size, ids).to(mask.dtype)
+
+        strength = draw(cfg.strength_scale, "strength", NUM_SLOTS)
+        self.friction[ids] = draw(cfg.friction, "friction", 1).squeeze(1)
+        self.motor_offset[ids] = draw(cfg.motor_offset, "motor_offset", NUM_SLOTS) * mask
+        self.latency[ids] = draw(cfg.sensing_latency_s, "latency", 1) / step_dt
+        self._stiffness_scale[ids] = strength * draw(cfg.stiffness_scale, "stiffness", NUM_SLOTS)
+        self._damping_scale[ids] = strength * draw(cfg.damping_scale, "damping", NUM_SLOTS)
+        self._apply(ids)
+
+    def initial_state(self, ids: Tensor, count: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Draw initial states: root (n, 13), canonical joint positions [rad] and velocities [rad/s] (n, 32)."""
+        robots = self._robots.rows(ids)
+        root = robots.total_mass.new_zeros(len(ids), 13)
+        root[:, 2] = robots.nominal_height + SPAWN_CLEARANCE * self.cfg.enabled
+        root[:, 3] = 1.0
+        joint_pos = robots.default_joint_pos.clone()
+        joint_vel = torch.zeros_like(joint_pos)
+        if self.cfg.enabled:
+            draw = self._rng.uniform_in
+            root[:, 0:2] = draw(-1.0, 1.0, "init_xy", count, 2, ids)
+            root[:, 3:7] = quat_from_yaw(draw(-np.pi, np.pi, "init_yaw", count, 1, ids).squeeze(1).to(root.dtype))
+            root[:, 7:13] = draw(*self.cfg.init_root_vel, "init_root_vel", count, 6, ids)
+            scale = draw(*self.cfg.init_joint_scale, "init_joint_scale", count, NUM_SLOTS, ids)
+            joint_pos = (joint_pos * scale).clamp(robots.joint_soft_lower, robots.joint_soft_upper)
+            joint_vel = draw(*self.cfg.init_joint_vel, "init_joint_vel", count, NUM_SLOTS, ids) * robots.slot_mask
+        return root, joint_pos, joint_vel
+
+    def push(self, steps: Tensor, penalty_scale: float, step_dt: float) -> None:
+        """Push the environments whose time has come; ``steps`` counts each one's control steps since creation."""
+        interval = round(self.cfg.push_interval_s / step_dt)
+        if not self.cfg.enabled or interval == 0:
+            return
+        ids = ((steps % interval) == interval - 1).nonzero().squeeze(1)
+        if len(ids) == 0:
+            return
+        u = 2.0 * self._rng.uniform("push", steps[ids], 6, ids) - 1.0
+        self._pool.push(
+            ids, u[:, :3] * self.cfg.push_lin_vel * penalty_scale, u[:, 3:] * self.cfg.push_ang_vel * penalty_scale
+        )
+
+    def state_dict(self) -> dict[str, Any]:
+        """The draws in force; those made at creation follow from the seed."""
+        names = ("friction", "motor_offset", "latency", "_stiffness_scale", "_damping_scale")
+        return {name: getattr(self, name).clone() for name in names}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore the draws and apply them to the physics."""
+        for name, value in state.items():
+            getattr(self, name).copy_(value)
+        if self.cfg.enabled:
+            self._apply(torch.arange(len(self.friction), device=self.friction.device))
+
+    def _apply(self, ids: Tensor) -> None:
+        """Write friction and gains of some environments into the physics."""
+        friction, kp, kd = (
+            x[ids].to("cpu", torch.float64).numpy() for x in (self.friction, self._stiffness_scale, self._damping_scale)
+        )
+        for robot, local, at in self._pool.split(ids):
+            batch = self._pool.batches[robot]
+            spec = batch.spec
+            batch.set_friction(local, friction[at])
+            batch.set_gains(local, spec.stiffness * kp[at][:, spec.slots], spec.damping * kd[at][:, spec.slots])
+
+    def _randomize_bodies(self) -> BodyChanges:
+        """Scale masses and shift centres of mass of every body of every environment, once."""
+        mass = self._robots.total_mass
+        shape = (len(mass), len(EMBODIMENT_LINKS))
+        changes = BodyChanges(mass.new_ones(shape), mass.new_zeros(shape), mass.new_zeros(*shape, 3))
+        if not self.cfg.enabled:
+            return changes
+        for batch, rows in zip(self._pool.batches, self._pool.rows, strict=True):
+            ids = torch.arange(rows.start, rows.stop, device=mass.device)
+            model, num_bodies = batch.model, batch.model.nbody
+            once = torch.zeros_like(ids)
+            scale = self._rng.uniform_in(*self.cfg.link_mass_scale, "link_mass", once, num_bodies, ids)
+            offset = self._rng.uniform_in(*self.cfg.link_com_offset, "link_com", once, 3 * num_bodies, ids)
+            offset = offset.reshape(-1, num_bodies, 3)
+            payload = self._rng.uniform_in(*self.cfg.base_mass_ratio, "base_mass", once, 1, ids).squeeze(1)
+            shift = self._rng.uniform_in(*self.cfg.base_com_offset, "base_com", once, 2, ids)
+            added = torch.zeros_like(scale)
+            base = model.body(batch.spec.base_link).id
+            added[:, base] = payload * batch.spec.total_mass
+            offset[:, base, :2] += shift
+            batch.scale_bodies(*(x.to("cpu", torch.float64).numpy() for x in (scale, added, offset)))
+            bodies = [model.body(batch.spec.link_roles[role]).id for role in EMBODIMENT_LINKS]
+            changes.mass_scale[rows] = scale[:, bodies].to(mass.dtype)
+            changes.added_mass[rows] = added[:, bodies].to(mass.dtype)
+            changes.com_offset[rows] = offset[:, bodies].to(mass.dtype)
+        return changes

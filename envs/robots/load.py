@@ -1,0 +1,300 @@
+"""From a robot's YAML and URDF to a checked ``RobotSpec``."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Hashable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from eagle_rl.errors import RobotError, did_you_mean
+from eagle_rl.paths import data_root
+
+from .slots import MIRROR_PERMUTATION, MIRROR_SIGN, SLOT_INDEX, SLOT_NAMES
+from .spec import COLLISION_LINKS, FALL_LINKS, FEET, Array, RobotSpec
+from .tree import Tree
+from .urdf import MAX_FILE_BYTES, MAX_VALUE, read_urdf
+
+ROLES = tuple(dict.fromkeys((*FALL_LINKS, "left_foot", "right_foot", "left_hand", "right_hand", *COLLISION_LINKS)))
+"""Every role a robot's links must fill."""
+
+REQUIRED = (
+    "name",
+    "title",
+    "urdf",
+    "base_link",
+    "roles",
+    "sole_centre_m",
+    "nominal_height_m",
+    "swing_height_m",
+    "joints",
+)
+OPTIONAL = ("imu", "collision_excludes", "sources", "mesh_dir")
+IMU_KEYS = ("link", "offset_m")
+JOINT_NUMBERS = {
+    "sign": -1.0,
+    "zero_offset_rad": -math.inf,
+    "default_angle_rad": -math.inf,
+    "stiffness_nm_per_rad": 0.0,
+    "damping_nms_per_rad": 0.0,
+    "armature_kgm2": 0.0,
+}
+"""Numbers of each joint, with their lower bounds."""
+
+HEIGHT_TOLERANCE = 0.01
+"""Most that ``nominal_height_m`` may differ from forward kinematics [m]."""
+
+
+def robot_names() -> tuple[str, ...]:
+    """Names of the shipped robots, in alphabetical order."""
+    return tuple(sorted(path.stem for path in (data_root() / "cfg" / "robots").glob("*.yaml")))
+
+
+def load_robot(name_or_path: str | Path) -> RobotSpec:
+    """Load a shipped robot by name, or any robot by the path of its YAML.
+
+    Raises:
+        RobotError: with every fault found in YAML and URDF, one a line.
+    """
+    path = _yaml_path(name_or_path)
+    return _Draft(path, _read_yaml(path)).spec()
+
+
+def _yaml_path(name_or_path: str | Path) -> Path:
+    path = Path(name_or_path)
+    if path.suffix in (".yaml", ".yml") or path.is_file():
+        return path.resolve()
+    names = robot_names()
+    if str(name_or_path) not in names:
+        raise RobotError(
+            f"Unknown robot {str(name_or_path)!r}.{did_you_mean(str(name_or_path), names)} "
+            f"Known: {', '.join(names)}; or give the path of a YAML."
+        )
+    return data_root() / "cfg" / "robots" / f"{name_or_path}.yaml"
+
+
+class _StrictLoader(yaml.SafeLoader):
+    """YAML without duplicate keys, which would silently win over each other, and without aliases."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
+        count = len(node.value)
+        mapping = super().construct_mapping(node, deep)
+        if len(mapping) != count:
+            raise yaml.constructor.ConstructorError(None, None, "a key appears twice in this mapping", node.start_mark)
+        return mapping
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        if self.check_event(yaml.AliasEvent):
+            raise yaml.composer.ComposerError(None, None, "aliases are not allowed", None)
+        return super().compose_node(parent, index)
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    try:
+        if path.stat().st_size > MAX_FILE_BYTES:
+            raise RobotError(f"Robot file {path} is larger than {MAX_FILE_BYTES} bytes.")
+        data = yaml.load(path.read_text(encoding="utf-8"), Loader=_StrictLoader)
+    except OSError as error:
+        raise RobotError(f"Robot file {path} cannot be read: {error.strerror}.") from error
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        if isinstance(error, RobotError):
+            raise
+        raise RobotError(f"Robot file {path} is not valid YAML: {error}") from error
+    if not isinstance(data, dict):
+        raise RobotError(f"Robot file {path} holds a {type(data).__name__}, expected a mapping with {REQUIRED}.")
+    return data
+
+
+class _Draft:
+    """A robot's YAML on its way to a ``RobotSpec``; gathers every fault."""
+
+    def __init__(self, path: Path, data: dict[str, Any]) -> None:
+        self.path = path
+        self.data = data
+        self.faults: list[str] = []
+
+    def spec(self) -> RobotSpec:
+        self._check_keys()
+        urdf_path = (self.path.parent / str(self.data.get("urdf", ""))).resolve()
+        tree = self._tree(urdf_path)
+        if tree is None:
+            self._raise_faults()
+            raise AssertionError("unreachable: a missing tree is a fault")
+        spec = RobotSpec(
+            name=str(self.data.get("name")),
+            title=str(self.data.get("title")),
+            urdf_path=urdf_path,
+            yaml_path=self.path,
+            total_mass=sum(body.inertial.mass for body in tree.bodies),
+            **self._joints(tree),
+            **self._links(tree),
+        )
+        self._raise_faults()
+        self.faults += consistency_faults(spec, tree)
+        self._raise_faults()
+        return spec
+
+    def _raise_faults(self) -> None:
+        if self.faults:
+            raise RobotError("\n".join(f"{self.path}: {fault}" for fault in self.faults))
+
+    def _check_keys(self) -> None:
+        known = (*REQUIRED, *OPTIONAL)
+        for key in self.data:
+            if key not in known:
+                self.faults.append(f"unknown key {key!r}.{did_you_mean(str(key), known)}")
+        self.faults += [f"key {key!r} is missing" for key in REQUIRED if key not in self.data]
+
+    def _tree(self, urdf_path: Path) -> Tree | None:
+        try:
+            return read_urdf(urdf_path)
+        except RobotError as error:
+            self.faults += str(error).splitlines()
+            return None
+
+    def _mapping(self, value: object, where: str, keys: Sequence[str]) -> dict[str, Any]:
+        """Check that ``value`` is a mapping with exactly ``keys``; faults are noted, an absent key is left out."""
+        if not isinstance(value, dict):
+            self.faults.append(f"{where} is {value!r:.80}, expected a mapping with {', '.join(keys)}")
+            return {}
+        for key in value:
+            if key not in keys:
+                self.faults.append(f"{where}: unknown key {key!r}.{did_you_mean(str(key), keys)}")
+        missing = [key for key in keys if key not in value]
+        if missing:
+            self.faults.append(f"{where}: missing {', '.join(missing)}")
+        return value
+
+    def _number(self, value: object, where: str, lower: float = -math.inf) -> float:
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= MAX_VALUE:
+            self.faults.append(f"{where} is {value!r:.80}, expected a finite number")
+            return 1.0
+        if value < lower:
+            self.faults.append(f"{where} is {value}, expected at least {lower:g}")
+        return float(value)
+
+    def _point(self, value: object, where: str) -> Array:
+        if not isinstance(value, list) or len(value) != 3:
+            self.faults.append(f"{where} is {value!r:.80}, expected three numbers [m]")
+            return np.zeros(3)
+        return np.array([self._number(part, where) for part in value])
+
+    def _link(self, value: object, where: str, tree: Tree) -> str:
+        """Resolve a link to the body that carries it."""
+        if value not in tree.link_names:
+            self.faults.append(
+                f"{where}: no link {value!r:.80} in the URDF.{did_you_mean(str(value), tree.link_names)}"
+            )
+            return tree.bodies[0].name
+        return tree.locate(str(value))[0].name
+
+    def _links(self, tree: Tree) -> dict[str, Any]:
+        data = self.data
+        roles = self._mapping(data.get("roles"), "roles", ROLES)
+        soles = self._mapping(data.get("sole_centre_m"), "sole_centre_m", FEET)
+        if data.get("base_link") != tree.bodies[0].name:
+            self.faults.append(
+                f"base_link is {data.get('base_link')!r:.80}, but the URDF's root is {tree.bodies[0].name}"
+            )
+        imu = self._mapping(data.get("imu", {"link": tree.bodies[0].name, "offset_m": [0, 0, 0]}), "imu", IMU_KEYS)
+        imu_link = self._link(imu.get("link"), "imu.link", tree)
+        return {
+            "base_link": tree.bodies[0].name,
+            "link_roles": {role: self._link(roles.get(role), f"roles.{role}", tree) for role in ROLES},
+            "sole_offsets": np.stack([self._sole(roles, soles, side, tree) for side in FEET]),
+            "nominal_height": self._number(data.get("nominal_height_m"), "nominal_height_m", 0.05),
+            "swing_height": self._number(data.get("swing_height_m"), "swing_height_m", 0.0),
+            "imu_link": imu_link,
+            "imu_offset": self._in_body(imu.get("link"), self._point(imu.get("offset_m"), "imu.offset_m"), tree),
+            "collision_excludes": self._excludes(tree),
+            "mesh_dir": (self.path.parent / str(data["mesh_dir"])).resolve() if "mesh_dir" in data else None,
+        }
+
+    def _sole(self, roles: dict[str, Any], soles: dict[str, Any], side: str, tree: Tree) -> Array:
+        point = self._point(soles.get(side), f"sole_centre_m.{side}")
+        return self._in_body(roles.get(f"{side}_foot"), point, tree)
+
+    def _in_body(self, link: object, point: Array, tree: Tree) -> Array:
+        return tree.locate(str(link))[1].apply(point) if link in tree.link_names else point
+
+    def _excludes(self, tree: Tree) -> tuple[tuple[str, str], ...]:
+        pairs = self.data.get("collision_excludes") or []
+        if not isinstance(pairs, list) or not all(isinstance(pair, list) and len(pair) == 2 for pair in pairs):
+            self.faults.append(f"collision_excludes is {pairs!r:.80}, expected a list of pairs of links")
+            return ()
+        return tuple(
+            (self._link(a, "collision_excludes", tree), self._link(b, "collision_excludes", tree)) for a, b in pairs
+        )
+
+    def _joints(self, tree: Tree) -> dict[str, Any]:
+        names = tuple(joint.name for joint in tree.joints)
+        entries = self._mapping(self.data.get("joints"), "joints", names)
+        rows = [self._joint(name, entries[name]) for name in names if name in entries]
+        slots = [row[0] for row in rows]
+        for slot in sorted({slot for slot in slots if slots.count(slot) > 1}):
+            users = [name for name, row in zip(names, rows, strict=False) if row[0] == slot]
+            self.faults.append(f"slot {SLOT_NAMES[slot]} is claimed by {', '.join(users)}")
+        numbers = np.array([row[1] for row in rows]).reshape(len(rows), len(JOINT_NUMBERS)).T
+        fields = ("signs", "zero_offsets", "default_joint_pos", "stiffness", "damping", "armature")
+        limits = np.array([(j.lower, j.upper, j.effort, j.velocity) for j in tree.joints]).reshape(len(names), 4).T
+        limit_fields = ("joint_lower", "joint_upper", "effort_limit", "velocity_limit")
+        return {
+            "joint_names": names,
+            "slots": np.array(slots, dtype=np.int64),
+            **dict(zip(fields, numbers, strict=True)),
+            **dict(zip(limit_fields, limits, strict=True)),
+        }
+
+    def _joint(self, name: str, entry: object) -> tuple[int, list[float]]:
+        where = f"joints.{name}"
+        entry = self._mapping(entry, where, ("slot", *JOINT_NUMBERS))
+        slot = entry.get("slot")
+        if slot not in SLOT_INDEX:
+            self.faults.append(f"{where}.slot: unknown slot {slot!r:.80}.{did_you_mean(str(slot), SLOT_NAMES)}")
+        numbers = [self._number(entry.get(key, 1.0), f"{where}.{key}", lower) for key, lower in JOINT_NUMBERS.items()]
+        if numbers[0] not in (1.0, -1.0):
+            self.faults.append(f"{where}.sign is {numbers[0]:g}, expected 1 or -1")
+        return SLOT_INDEX.get(str(slot), 0), numbers
+
+
+def consistency_faults(spec: RobotSpec, tree: Tree) -> list[str]:
+    """Faults that no single number shows: default pose, left/right symmetry, nominal height."""
+    faults = [
+        f"joints.{name}.default_angle_rad is {angle:g}, outside its limits [{lower:g}, {upper:g}]"
+        for name, angle, lower, upper in zip(
+            spec.joint_names, spec.default_joint_pos, spec.joint_lower, spec.joint_upper, strict=True
+        )
+        if not lower <= angle <= upper
+    ]
+    faults += _asymmetries(spec)
+    height = default_height(spec, tree)
+    if abs(height - spec.nominal_height) > HEIGHT_TOLERANCE:
+        faults.append(
+            f"nominal_height_m is {spec.nominal_height:g}, but in the default pose the base is {height:.4f} m above "
+            "the lower sole; correct it, or default_angle_rad, or sole_centre_m"
+        )
+    return faults
+
+
+def default_height(spec: RobotSpec, tree: Tree) -> float:
+    """Height of the base above the lower sole centre in the default pose, base upright [m]."""
+    poses = tree.forward(spec.default_joint_pos)
+    feet = [poses[spec.link_roles[f"{side}_foot"]] for side in FEET]
+    return -min(float(foot.apply(sole)[2]) for foot, sole in zip(feet, spec.sole_offsets, strict=True))
+
+
+def _asymmetries(spec: RobotSpec) -> list[str]:
+    mask = spec.slot_mask
+    unpaired = [SLOT_NAMES[slot] for slot in np.flatnonzero(mask & ~mask[MIRROR_PERMUTATION])]
+    if unpaired:
+        return [f"slots without their left/right partner: {', '.join(unpaired)}"]
+    canonical = spec.to_canonical(spec.default_joint_pos)
+    mirrored = MIRROR_SIGN * canonical[MIRROR_PERMUTATION]
+    return [
+        f"default pose is not left/right symmetric at {SLOT_NAMES[slot]}: canonical {canonical[slot]:g} rad, "
+        f"mirror image {mirrored[slot]:g}"
+        for slot in np.flatnonzero(np.abs(canonical - mirrored) > 1e-6)
+    ]

@@ -1,0 +1,93 @@
+"""Per-robot averages of rewards, errors and terminations, kept on the device and read once per interval."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+ERROR_NAMES = ("E_vx", "E_vy", "E_omega", "E_h", "E_p")
+
+
+def episode_ratio(falls_per_step: Tensor, max_episode_length: int) -> Tensor:
+    """Mean episode length over the full length at a constant rate of falls, ``(1 - exp(-x)) / x``; unlike the mean of
+    finished episodes it does not wait for the long ones to finish. Shapes (R,)."""
+    falls = (falls_per_step * max_episode_length).clamp(min=1e-6)
+    return -torch.expm1(-falls) / falls
+
+
+class StepLog:
+    """Sums over the steps of an interval, one row per robot."""
+
+    def __init__(self, robot_names: list[str], robot_id: Tensor) -> None:
+        """Start empty for robots of these names; ``robot_id`` is each environment's, shape (N,)."""
+        self._names = robot_names
+        self._robot_id = robot_id
+        counts = torch.bincount(robot_id, minlength=len(robot_names)).to(torch.float64)
+        self._num_envs = counts.unsqueeze(1)
+        self._sums: Tensor | None = None
+        self._columns: list[str] = []
+        self._steps = 0
+
+    def add(
+        self,
+        terms: dict[str, Tensor],
+        reasons: dict[str, Tensor],
+        errors: Tensor,
+        contact_match: Tensor,
+        falls: Tensor,
+        dones: Tensor,
+        standing: Tensor,
+    ) -> None:
+        """Add one step: weighted reward terms (N,), termination reasons (N,), errors (N, 5) and the rest (N,)."""
+        moving = (~standing).to(contact_match.dtype)
+        self._columns = [
+            *(f"Episode_Reward/{name}" for name in terms),
+            *(f"Episode_Termination/{name}" for name in reasons),
+            *(f"Metrics/{name}" for name in ERROR_NAMES),
+            *("match", "moving", "falls", "dones"),
+        ]
+        rows = torch.stack(
+            [*terms.values(), *(reason.to(errors.dtype) for reason in reasons.values()), *errors.unbind(1)]
+            + [contact_match * moving, moving, falls.to(errors.dtype), dones.to(errors.dtype)],
+            dim=1,
+        ).double()
+        if self._sums is None:
+            self._sums = rows.new_zeros(len(self._names), rows.shape[1])
+        self._sums.index_add_(0, self._robot_id, rows)
+        self._steps += 1
+
+    def flush(self) -> tuple[dict[str, Tensor], Tensor, Tensor]:
+        """Return the interval's tags, each robot's falls per step (R,) and contact match (R,), and start anew.
+
+        Rewards are per second, terminations are shares of the episodes that ended, errors are means over steps.
+        """
+        assert self._sums is not None, "flush follows add"
+        sums, column = self._sums, {name: i for i, name in enumerate(self._columns)}
+        env_steps = self._num_envs * self._steps
+        means = sums / env_steps
+        match = sums[:, column["match"]] / sums[:, column["moving"]].clamp(min=1.0)
+        dones = sums[:, column["dones"]]
+        falls_per_step = means[:, column["falls"]]
+        entry: dict[str, Tensor] = {}
+        for robot, name in enumerate(self._names):
+            for tag, i in column.items():
+                if tag.startswith("Metrics/"):
+                    entry[f"{tag}/{name}"] = means[robot, i]
+                elif tag.startswith("Episode_Reward/"):
+                    entry[f"{tag}/{name}"] = means[robot, i] * 50.0
+                elif tag.startswith("Episode_Termination/"):
+                    entry[f"{tag}/{name}"] = sums[robot, i] / dones[robot].clamp(min=1.0)
+            entry[f"Metrics/contact_match/{name}"] = match[robot]
+            entry[f"Metrics/falls_per_1000_steps/{name}"] = falls_per_step[robot] * 1000.0
+        self._sums, self._steps = torch.zeros_like(sums), 0
+        return entry, falls_per_step, match
+
+    def state_dict(self) -> dict[str, Any]:
+        """The sums of the unfinished interval."""
+        return {"sums": None if self._sums is None else self._sums.clone(), "steps": self._steps, "columns": self._columns}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`state_dict` returned."""
+        self._sums, self._steps, self._columns = state["sums"], state["steps"], list(state["columns"])

@@ -1,0 +1,110 @@
+"""The protocol judged by policies whose scores have closed forms."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from eagle_rl.config.schema import EvaluationCfg, TaskCfg
+from eagle_rl.evaluation.evaluate import EvaluationResult, evaluate
+from eagle_rl.evaluation.metrics import RobotMetrics
+from tests.evaluation.fake import ScriptedEnv, idle, make_scripted_env, perfect
+
+FLOORS = (0.50, 0.20, 0.50, 0.15, 0.2125)
+"""Mean |c_d| of U[-.6, 1.2], U[-.4, .4], U[-1, 1], U[-.3, 0], U[-.3, .5]."""
+
+EV = EvaluationCfg(num_envs_per_robot=4000, num_steps=4)
+
+
+def run(policy, make_env=make_scripted_env, ev=EV, **kwargs) -> RobotMetrics:
+    return evaluate(policy, make_env, ["h1"], TaskCfg(), ev, **kwargs)["h1"]
+
+
+@pytest.mark.parametrize("protocol", ["single", "joint"])
+def test_a_perfect_tracker_scores_zero(protocol):
+    metrics = run(perfect, ev=dataclasses.replace(EV, protocol=protocol))
+    assert metrics.survival == 1.0
+    assert metrics.subsets["all"].errors == pytest.approx((0,) * 5, abs=1e-7)
+
+
+@pytest.mark.parametrize("protocol", ["single", "joint"])
+@pytest.mark.parametrize("resampling_time_s", [0.0, 0.02])
+def test_an_idle_robot_scores_the_closed_form_floors(protocol, resampling_time_s):
+    ev = dataclasses.replace(EV, protocol=protocol, resampling_time_s=resampling_time_s)
+    assert run(idle, ev=ev).subsets["all"].errors == pytest.approx(FLOORS, rel=0.05)
+
+
+def test_the_best_constant_scores_its_closed_form():
+    middle = torch.tensor([0.3, 0.0, 0.0, -0.15, 0.1])
+    metrics = run(lambda obs: torch.nn.functional.pad(middle.expand(len(obs), 5), (0, 27)))
+    assert metrics.subsets["all"].errors == pytest.approx((0.45, 0.20, 0.50, 0.075, 0.20), rel=0.05)
+
+
+def test_after_a_fall_own_errors_stop_and_charged_errors_are_those_of_standing_still():
+    def falls_in_third_step(robots: Sequence[str], num_envs: int, task: TaskCfg, seed: int) -> ScriptedEnv:
+        return ScriptedEnv(num_envs, task, fall_at=3)
+
+    metrics = run(perfect, falls_in_third_step)
+    assert metrics.survival == 0.0
+    assert metrics.upright == pytest.approx(0.5)
+    assert metrics.subsets["all"].errors == pytest.approx((0,) * 5, abs=1e-7)
+    assert metrics.subsets["all"].charged == pytest.approx([0.5 * floor for floor in FLOORS], rel=0.05)
+
+
+def test_a_fall_in_the_first_step_leaves_no_own_errors_but_the_whole_charge():
+    metrics = run(idle, lambda robots, n, task, seed: ScriptedEnv(n, task, fall_at=1))
+    assert metrics.subsets["all"].errors == (None,) * 5
+    assert metrics.subsets["all"].charged == pytest.approx(FLOORS, rel=0.05)
+
+
+def noisy(obs: TensorDict) -> Tensor:
+    """A network whose rounding may depend on how many rows it sees."""
+    hidden = torch.tanh(obs["command"] @ torch.linspace(-1, 1, 5 * 64).view(5, 64))
+    return hidden @ torch.linspace(-1, 1, 64 * 32).view(64, 32)
+
+
+def test_the_result_does_not_depend_on_the_chunk_size():
+    ev = dataclasses.replace(EV, num_envs_per_robot=700)
+    results = [run(noisy, ev=ev, chunk_envs=chunk) for chunk in (128, 512, 10_000)]
+    assert results[0] == results[1] == results[2]
+
+
+def test_subsets_cover_what_their_names_say():
+    subsets = run(perfect).subsets
+    assert subsets["standing"].share + subsets["walking"].share == pytest.approx(1.0)
+    assert subsets["squatting"].share == pytest.approx(0.5, abs=0.03)
+    assert subsets["leaning"].share == pytest.approx((0.1 + 0.3) / 0.8, abs=0.03)
+    assert subsets["settled"].share == 0.0
+
+
+def test_settled_steps_begin_one_second_after_each_new_command():
+    ev = EvaluationCfg(num_envs_per_robot=8, num_steps=120, resampling_time_s=1.2)
+    assert run(perfect, ev=ev).subsets["settled"].share == pytest.approx(20 / 120)
+
+
+def test_the_task_of_an_evaluation_has_no_aids_noise_or_time_out():
+    seen = []
+
+    def spy(robots: Sequence[str], num_envs: int, task: TaskCfg, seed: int) -> ScriptedEnv:
+        seen.append(task)
+        return ScriptedEnv(num_envs, task)
+
+    run(perfect, spy)
+    task = seen[0]
+    assert (task.aids.harness, task.aids.gait_shaping) == (0.0, 0.0)
+    assert not task.commands.curriculum.enabled
+    assert not task.randomization.enabled
+    assert not task.observations.enable_corruption
+    assert task.terminations.episode_length_s > EV.num_steps * 0.02
+    assert (task.sim.physics_dt, task.sim.decimation) == (0.005, 4)
+
+
+def test_a_result_survives_its_json():
+    metrics = evaluate(perfect, make_scripted_env, ["h1", "g1"], TaskCfg(), EV)
+    result = EvaluationResult(checkpoint="0" * 64, protocol=EV, robots=metrics, seed=3)
+    assert EvaluationResult.from_json(result.to_json()) == result

@@ -1,0 +1,44 @@
+"""Commands of an evaluation."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from eagle_rl.config.schema import CommandsCfg, EvaluationCfg
+from eagle_rl.evaluation.protocol import COMMANDS, draw_commands, varied_commands
+
+CFG = CommandsCfg()
+EV = EvaluationCfg(num_steps=400, resampling_time_s=4.0)
+
+
+@given(few=st.integers(1, 50), more=st.integers(0, 50))
+def test_more_environments_move_nobody_elses_commands(few, more):
+    assert torch.equal(draw_commands(CFG, EV, "h1", few), draw_commands(CFG, EV, "h1", few + more)[:few])
+
+
+@given(seed=st.integers(0, 2**31), protocol=st.sampled_from(["single", "joint"]))
+def test_commands_stay_in_the_finishing_ranges_and_others_are_zero(seed, protocol):
+    ev = dataclasses.replace(EV, seed=seed, protocol=protocol)
+    commands = draw_commands(CFG, ev, "g1", 40)
+    assert commands.shape == (40, 2, 5)
+    for d, name in enumerate(COMMANDS):
+        low, high = getattr(CFG, name).finishing
+        assert ((commands[..., d] >= low) & (commands[..., d] <= high)).all()
+    assert (commands[~varied_commands(ev, 40).unsqueeze(1).expand_as(commands)] == 0).all()
+
+
+def test_single_splits_the_environments_evenly_over_the_commands():
+    varied = varied_commands(EvaluationCfg(protocol="single"), 100)
+    assert (varied.sum(0) == 20).all()
+    assert (varied.sum(1) == 1).all()
+
+
+def test_robots_and_seeds_draw_different_commands():
+    drawn = [
+        draw_commands(CFG, dataclasses.replace(EV, seed=seed), robot, 4) for seed in (1, 2) for robot in ("h1", "g1")
+    ]
+    assert len({tuple(d.flatten().tolist()) for d in drawn}) == 4

@@ -1,0 +1,81 @@
+"""Tables of known results."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+
+import pytest
+
+from eagle_rl.config.schema import EvaluationCfg, TaskCfg
+from eagle_rl.errors import ConfigError
+from eagle_rl.evaluation.evaluate import EvaluationResult, evaluate
+from eagle_rl.evaluation.metrics import SUBSETS, RobotMetrics, TrackingErrors
+from eagle_rl.evaluation.reference import PAPER, STAND_STILL
+from eagle_rl.evaluation.report import FORMATS, pooled_score, to_csv, to_json, to_latex, to_markdown, tracking_table
+from tests.evaluation.fake import idle, make_scripted_env, perfect
+
+EV = EvaluationCfg(num_envs_per_robot=16, num_steps=2)
+
+
+def result(errors: tuple[float | None, ...], seed: int = 1, ev: EvaluationCfg = EV, robots=("h1",)) -> EvaluationResult:
+    subset = TrackingErrors(share=1.0, errors=errors, charged=tuple(e and 2 * e for e in errors))
+    metrics = RobotMetrics(num_envs=16, survival=0.5, upright=0.75, subsets=dict.fromkeys(SUBSETS, subset))
+    return EvaluationResult(checkpoint=f"{seed:064x}", protocol=ev, robots=dict.fromkeys(robots, metrics), seed=seed)
+
+
+def test_seeds_become_mean_and_standard_deviation():
+    runs = [result((0.1, 0.2, 0.3, 0.4, 0.5), seed=1), result((0.3, 0.2, 0.3, 0.4, 0.5), seed=2)]
+    row = tracking_table({"EAGLE": runs}, falls="errors").rows[-1]
+    assert row.cells[0].mean == pytest.approx(0.2)
+    assert row.cells[0].std == pytest.approx(0.1 * 2**0.5)
+    assert row.cells[1].std == pytest.approx(0.0)
+    assert row.seeds == (1, 2)
+
+
+def test_the_papers_number_stands_beside_ours_only_for_its_methods_and_robots():
+    table = tracking_table({"EAGLE": [result((0.1,) * 5, robots=("h1", "mine"))], "mine": [result((0.1,) * 5)]})
+    papers = {(row.robot, row.method): row.cells[0].paper for row in table.rows}
+    assert papers[("h1", "EAGLE")] == PAPER["EAGLE"]["h1"][0]
+    assert papers[("mine", "EAGLE")] is None
+    assert papers[("h1", "mine")] is None
+
+
+def test_charged_errors_are_shown_unless_asked_otherwise():
+    runs = {"PPO": [result((0.1,) * 5)]}
+    assert tracking_table(runs).rows[-1].cells[0].mean == pytest.approx(0.2)
+    assert tracking_table(runs, falls="errors").rows[-1].cells[0].mean == pytest.approx(0.1)
+
+
+def test_every_robot_has_the_floor_rows():
+    table = tracking_table({"PPO": [result((0.1,) * 5, robots=("h1", "g1"))]})
+    floors = [row for row in table.rows if row.method == "stand still"]
+    assert [row.robot for row in floors] == ["h1", "g1"]
+    assert tuple(cell.mean for cell in floors[0].cells) == STAND_STILL
+
+
+def test_results_of_different_protocols_are_refused():
+    other = EvaluationCfg(num_envs_per_robot=17)
+    with pytest.raises(ConfigError, match="one protocol"):
+        tracking_table({"PPO": [result((0.1,) * 5)], "EAGLE": [result((0.1,) * 5, ev=other)]})
+
+
+def test_all_formats_carry_the_same_numbers():
+    table = tracking_table({"PPO": [result((0.1234, 0.2, 0.3, 0.4, 0.5))]}, falls="errors")
+    assert set(FORMATS) == {"md", "csv", "tex", "json"}
+    assert "0.123 [0.108]" in to_markdown(table)
+    assert "0.123 [0.108]" in to_latex(table)
+    assert float(list(csv.DictReader(io.StringIO(to_csv(table))))[-1]["E_vx"]) == 0.1234
+    assert json.loads(to_json(table))["rows"][-1]["cells"][0]["mean"] == 0.1234
+
+
+def test_a_subset_without_steps_shows_a_dash():
+    table = tracking_table({"PPO": [result((None,) * 5)]}, falls="errors")
+    assert "| - [0.108] |" in to_markdown(table)
+
+
+def test_the_pooled_score_is_zero_for_a_perfect_and_one_for_an_idle_robot():
+    ev = EvaluationCfg(num_envs_per_robot=4000, num_steps=1)
+    scores = [pooled_score(evaluate(p, make_scripted_env, ["h1", "g1"], TaskCfg(), ev)) for p in (perfect, idle)]
+    assert scores == pytest.approx([0.0, 1.0], abs=0.02)
