@@ -7,10 +7,19 @@ from collections.abc import Iterable
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from eagle_rl.config.docs import field_docs
-from eagle_rl.config.schema import AidsCfg, CommandsCfg, ObservationsCfg, RandomizationCfg, RewardsCfg, TaskCfg
+from eagle_rl.config.schema import (
+    AidsCfg,
+    CommandsCfg,
+    ObservationsCfg,
+    RandomizationCfg,
+    RewardsCfg,
+    TaskCfg,
+    TerminationsCfg,
+)
 from eagle_rl.config.validate import CONTROL_STEP
 
 COMMAND_UNITS = {
@@ -22,12 +31,14 @@ COMMAND_UNITS = {
 }
 
 
-def _table(title: str, columns: Iterable[str], rows: Iterable[Iterable[str]]) -> Table:
+def make_table(title: str, columns: Iterable[str], rows: Iterable[Iterable[str]]) -> Table:
+    """A plain table for the terminal."""
     table = Table(title=title, title_justify="left", title_style="bold", box=None, pad_edge=False, header_style="dim")
+    table.min_width = len(title)
     for column in columns:
-        table.add_column(column, overflow="fold")
+        table.add_column(escape(column), overflow="fold")
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*(escape(cell.replace("``", "")) for cell in row))
     return table
 
 
@@ -41,7 +52,7 @@ def _commands(cfg: CommandsCfg) -> Table:
     ranges = {name: getattr(cfg, name) for name in COMMAND_UNITS}
     rows = [(name, _text(r.initial), _text(r.finishing), COMMAND_UNITS[name]) for name, r in ranges.items()]
     title = f"Commands: drawn every {cfg.resampling_time_s:g} s, standing with probability {cfg.standing_probability:g}"
-    return _table(title, ("command", "initial", "finishing", "unit"), rows)
+    return make_table(title, ("command", "initial", "finishing", "unit"), rows)
 
 
 def _observations(cfg: ObservationsCfg) -> Table:
@@ -65,7 +76,7 @@ def _observations(cfg: ObservationsCfg) -> Table:
         for group, terms in groups.items()
         for term in terms
     ]
-    return _table("Observations", ("group", "term", "size", "scale", "noise ±", "unit"), rows)
+    return make_table("Observations", ("group", "term", "size", "scale", "noise ±", "unit"), rows)
 
 
 def _rewards(cfg: RewardsCfg) -> Table:
@@ -77,13 +88,18 @@ def _rewards(cfg: RewardsCfg) -> Table:
         for name, weight in weights.items()
     ]
     title = f"Rewards: orientation {cfg.orientation}, penalty factor k from {cfg.penalty_initial:g}"
-    return _table(title, ("term", "weight", "per step", "value"), rows)
+    return make_table(title, ("term", "weight", "per step", "value"), rows)
 
 
-def _documented(title: str, cfg: RandomizationCfg | AidsCfg | Any) -> Table:
+def _documented(title: str, cfg: RandomizationCfg | AidsCfg | TerminationsCfg) -> Table:
     docs = field_docs(cfg)
     rows = [(f.name, _text(getattr(cfg, f.name)), docs.get(f.name, "")) for f in dataclasses.fields(cfg)]
-    return _table(title, ("key", "value", "meaning"), rows)
+    return make_table(title, ("key", "value", "meaning"), rows)
+
+
+def randomization_table(cfg: RandomizationCfg) -> Table:
+    """Every row of domain randomization with range and unit."""
+    return _documented("Randomization" if cfg.enabled else "Randomization (off)", cfg)
 
 
 def print_mdp(task: TaskCfg, console: Console) -> None:
@@ -93,7 +109,7 @@ def print_mdp(task: TaskCfg, console: Console) -> None:
         _observations(task.observations),
         _rewards(task.rewards),
         _documented("Terminations", task.terminations),
-        _documented("Randomization" if task.randomization.enabled else "Randomization (off)", task.randomization),
+        randomization_table(task.randomization),
         _documented("Learning aids", task.aids),
     ):
         console.print(table)

@@ -46,6 +46,8 @@ def _describe(hint: Any) -> str:
         return "one of " + ", ".join(map(str, args))
     if origin is tuple and args[-1] is Ellipsis:
         return f"a list of {_PLURALS[args[0]]}"
+    if origin is tuple and len(set(args)) == 1:
+        return f"a list of {len(args)} {_PLURALS[args[0]]}"
     if origin is tuple:
         return "a list of " + ", ".join(_WORDS[a] for a in args)
     if origin in (Union, types.UnionType):
@@ -59,7 +61,7 @@ def _sequence(value: Any, hint: Any) -> tuple[Any, ...]:
         raise _MismatchError(_describe(hint))
     items = [args[0]] * len(value) if args[-1] is Ellipsis else list(args)
     if len(items) != len(value):
-        raise _MismatchError(f"{_describe(hint)} ({len(items)} values)")
+        raise _MismatchError(_describe(hint))
     try:
         return tuple(convert(v, h) for v, h in zip(value, items, strict=True))
     except _MismatchError as error:
@@ -82,6 +84,8 @@ def convert(value: Any, hint: Any) -> Any:
         _MismatchError: the value is of another kind; nothing is guessed (no number from text, no bool from 0).
     """
     origin = get_origin(hint)
+    if origin is tuple and len(set(args)) == 1:
+        return f"a list of {len(args)} {_PLURALS[args[0]]}"
     if origin is tuple:
         return _sequence(value, hint)
     if origin in (Union, types.UnionType):

@@ -247,6 +247,7 @@ class TerminationsCfg:
     """When an episode ends (HugWBC 9)."""
 
     episode_length_s: float = 20.0
+    """Time limit [s]."""
     max_roll: float = 0.8
     """[rad]"""
     max_pitch: float = 1.0
@@ -310,6 +311,7 @@ class AidsCfg:
     gait_shaping: float = 1.0
     """Start scale s of the softened contact kernel, kappa = 50 + 1e4 s, weights x (1 + 2 s); 0 is off."""
     gait_shaping_decay: float = 0.02
+    """Relative decay of gait shaping per ``interval_steps`` while contacts match the clock."""
     interval_steps: int = 24
     """Control steps between updates of both scales."""
     min_episode_ratio: float = 0.6

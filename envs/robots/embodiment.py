@@ -108,8 +108,11 @@ def pooled_embodiment(
 
 @cache
 def reference_statistics() -> tuple[Array, Array]:
-    """Mean and standard deviation of the thirty channels, shape (30,) each: over the reference robots, their mirror
-    images and the default randomization, so that the left/right mirror of a standardised vector is exact."""
+    """Mean and standard deviation of the thirty channels, shape (30,) each.
+
+    Taken over the reference robots, their mirror images, so that the left/right mirror of a standardised vector is
+    exact, and the default randomization.
+    """
     cfg = RandomizationCfg()
     moments = [_moments(load_robot(name), cfg) for name in REFERENCE_ROBOTS]
     moments += [(mirrored(mean, sign=True), mirrored(variance, sign=False)) for mean, variance in moments]

@@ -129,6 +129,7 @@ class _Draft:
             urdf_path=urdf_path,
             yaml_path=self.path,
             total_mass=sum(body.inertial.mass for body in tree.bodies),
+            sources=self._sources(),
             **self._joints(tree),
             **self._links(tree),
         )
@@ -154,6 +155,13 @@ class _Draft:
         except RobotError as error:
             self.faults += str(error).splitlines()
             return None
+
+    def _sources(self) -> dict[str, str]:
+        sources = self.data.get("sources", {})
+        if not isinstance(sources, dict):
+            self.faults.append(f"sources is {sources!r:.80}, expected a mapping from a topic to its origin")
+            return {}
+        return {str(topic): str(origin) for topic, origin in sources.items()}
 
     def _mapping(self, value: object, where: str, keys: Sequence[str]) -> dict[str, Any]:
         """Check that ``value`` is a mapping with exactly ``keys``; faults are noted, an absent key is left out."""
@@ -210,8 +218,16 @@ class _Draft:
             "imu_link": imu_link,
             "imu_offset": self._in_body(imu.get("link"), self._point(imu.get("offset_m"), "imu.offset_m"), tree),
             "collision_excludes": self._excludes(tree),
-            "mesh_dir": (self.path.parent / str(data["mesh_dir"])).resolve() if "mesh_dir" in data else None,
+            "mesh_dir": self._mesh_dir(),
         }
+
+    def _mesh_dir(self) -> Path | None:
+        if self.data.get("mesh_dir") is None:
+            return None
+        folder = (self.path.parent / str(self.data["mesh_dir"])).resolve()
+        if not folder.is_dir():
+            self.faults.append(f"mesh_dir {folder} is not a folder; leave the key out to render primitives")
+        return folder
 
     def _sole(self, roles: dict[str, Any], soles: dict[str, Any], side: str, tree: Tree) -> Array:
         point = self._point(soles.get(side), f"sole_centre_m.{side}")

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import mujoco
 import numpy as np
 
 from eagle_rl.config.schema import SimCfg
+from eagle_rl.errors import RobotError
 from envs.sim.height_field import HeightField
 
 from .sensors import FLOOR, IMU_SITE, NUM_SENSORS, SENSOR_SLICES, SOLE_SITES, add_sensors
@@ -27,6 +30,7 @@ _GEOM_TYPES = {
     "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
     "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
 }
+_MESH_SUFFIXES = (".obj", ".stl")
 _FLOOR_BIT, _ROBOT_BIT = 1, 2
 _FLOOR_DEPTH = 1.0
 """Thickness of the ground below the lowest point of a height field [m]."""
@@ -39,15 +43,25 @@ def build_model(spec: RobotSpec, sim: SimCfg, heightfield: HeightField | None = 
     target [rad] in the same order. kp acts in the actuator, whose force is clipped to the effort limit, and kd as
     passive joint damping, so that it stays implicit when the actuator saturates; the motor's torque is
     ``actuator_force - kd * qvel``.
+
+    Raises:
+        RobotError: if MuJoCo refuses the robot.
     """
     world = build_spec(spec, sim)
     add_floor(world, heightfield)
     add_sensors(world, spec)
-    return world.compile()
+    try:
+        return world.compile()
+    except ValueError as error:
+        raise RobotError(f"{spec.yaml_path}: MuJoCo refuses the robot: {error}") from error
 
 
 def build_spec(spec: RobotSpec, sim: SimCfg, *, visuals: bool = False) -> mujoco.MjSpec:
-    """Build the robot alone, without floor or sensors, so that several can be attached to one scene."""
+    """Build the robot alone, without floor or sensors, so that several can be attached to one scene.
+
+    With ``visuals`` the shapes that only show are added; where ``spec.mesh_dir`` holds ``<link>.obj`` or
+    ``<link>.stl``, that mesh is shown on the link instead.
+    """
     world = mujoco.MjSpec()
     world.modelname = spec.name
     set_options(world, sim)
@@ -55,7 +69,12 @@ def build_spec(spec: RobotSpec, sim: SimCfg, *, visuals: bool = False) -> mujoco
     bodies: list[mujoco.MjsBody] = []
     for body in tree.bodies:
         parent = world.worldbody if body.parent < 0 else bodies[body.parent]
-        bodies.append(_add_body(parent, body, spec, sim.self_collision, visuals))
+        bodies.append(_add_body(parent, body, spec))
+        meshes = _meshes(spec, body) if visuals else {}
+        _add_meshes(world, bodies[-1], body, meshes)
+        for shape in body.shapes:
+            if not shape.visual or (visuals and not meshes):
+                _add_geom(bodies[-1], shape, sim.self_collision)
     for index in range(spec.num_joints):
         _add_actuator(world, spec, index)
     for first, second in spec.collision_excludes:
@@ -111,9 +130,7 @@ def set_options(world: mujoco.MjSpec, sim: SimCfg) -> None:
     option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ISLAND) | int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
 
 
-def _add_body(
-    parent: mujoco.MjsBody, body: Body, spec: RobotSpec, self_collision: bool, visuals: bool
-) -> mujoco.MjsBody:
+def _add_body(parent: mujoco.MjsBody, body: Body, spec: RobotSpec) -> mujoco.MjsBody:
     inertial = body.inertial
     out = parent.add_body(
         name=body.name,
@@ -128,10 +145,30 @@ def _add_body(
         out.add_freejoint(name="base")
     else:
         _add_joint(out, body, spec)
-    for shape in body.shapes:
-        if visuals or not shape.visual:
-            _add_geom(out, shape, self_collision)
     return out
+
+
+def _meshes(spec: RobotSpec, body: Body) -> dict[str, Path]:
+    """The user's mesh file of each link of a body, where there is one."""
+    if spec.mesh_dir is None:
+        return {}
+    files = {path.stem: path for path in spec.mesh_dir.iterdir() if path.suffix.lower() in _MESH_SUFFIXES}
+    return {link: files[link] for link in body.members if link in files}
+
+
+def _add_meshes(world: mujoco.MjSpec, out: mujoco.MjsBody, body: Body, meshes: dict[str, Path]) -> None:
+    for link, path in meshes.items():
+        world.add_mesh(name=link, file=str(path))
+        out.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_MESH,
+            meshname=link,
+            pos=body.members[link].pos,
+            quat=_quaternion(body.members[link].rot),
+            rgba=body.shapes[0].rgba if body.shapes else [0.6, 0.6, 0.6, 1.0],
+            group=VISUAL_GROUP,
+            contype=0,
+            conaffinity=0,
+        )
 
 
 def _add_joint(out: mujoco.MjsBody, body: Body, spec: RobotSpec) -> None:

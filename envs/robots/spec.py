@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -78,6 +78,8 @@ class RobotSpec:
     """Pairs of links that never collide."""
     mesh_dir: Path | None = None
     """Folder of the vendor's meshes a user may point at for rendering; never shipped."""
+    sources: dict[str, str] = field(default_factory=dict)
+    """Where each group of numbers comes from."""
 
     @property
     def num_joints(self) -> int:

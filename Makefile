@@ -1,0 +1,62 @@
+# Everything a newcomer types. Each verb first makes .venv if it is not there or out of date.
+#
+#   make train     the quickstart experiment: the whole loop on five robots, a tracking table at the end
+#   make play      the published policy, or CKPT=PATH, on five robots side by side
+#   make test      all tests            make check     format, lint, types
+#   make bench     throughput           make package   sdist and wheel, installed and tried in an empty folder
+#   make clean     remove what was built (never logs/)
+#
+# PYTHON names the interpreter (3.10 to 3.13). CONSTRAINTS= installs the newest allowed packages instead of the tested
+# set. PIP_ARGS goes to pip when torch is installed, e.g. an --index-url with CPU-only builds, which are far smaller.
+
+PYTHON ?= python3
+VENV ?= .venv
+CONSTRAINTS ?= -c constraints.txt
+PIP_ARGS ?=
+CKPT ?=
+
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
+INSTALLED := $(VENV)/.installed
+
+.PHONY: setup train play test check bench package clean help
+
+help:
+	@sed -n 's/^# \{0,1\}//p' Makefile
+
+setup: $(INSTALLED)
+
+$(INSTALLED): setup.py constraints.txt
+	@echo "Installing into $(VENV) (a few minutes the first time)"
+	@$(PYTHON) -m venv $(VENV) || { echo "$(PYTHON) cannot make environments; on Debian: apt install python3-venv" >&2; exit 1; }
+	@$(PIP) install $(CONSTRAINTS) $(PIP_ARGS) torch
+	@$(PIP) install $(CONSTRAINTS) -e '.[dev]'
+	@touch $@
+
+train: $(INSTALLED)
+	$(BIN)/python train.py quickstart
+
+play: $(INSTALLED)
+	$(BIN)/python play.py $(CKPT)
+
+test: $(INSTALLED)
+	$(BIN)/python -m pytest
+
+check: $(INSTALLED)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+bench: $(INSTALLED)
+	$(BIN)/eagle bench
+
+package: $(INSTALLED)
+	rm -rf dist build
+	$(BIN)/python -m build --no-isolation --outdir dist .
+	$(PYTHON) -m venv dist/venv
+	dist/venv/bin/python -m pip --quiet install $(CONSTRAINTS) $(PIP_ARGS) torch
+	dist/venv/bin/python -m pip --quiet install $(CONSTRAINTS) dist/*.whl
+	mkdir dist/empty && cd dist/empty && ../venv/bin/eagle doctor && ../venv/bin/train.py smoke
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .coverage

@@ -1,0 +1,122 @@
+"""``eagle doctor``: is this installation complete, and can this machine do what will be asked of it?"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Sequence
+from importlib.metadata import PackageNotFoundError, requires
+from pathlib import Path
+from typing import NamedTuple
+
+from packaging.requirements import Requirement
+
+from eagle_rl.config.compose import known_names
+from eagle_rl.config.load import load_experiment
+from eagle_rl.errors import EagleError
+from eagle_rl.paths import data_root
+
+from .provenance import installed_version
+
+_RENDER = """
+import mujoco
+model = mujoco.MjModel.from_xml_string('<mujoco><worldbody><light/><geom size=".1"/></worldbody></mujoco>')
+mujoco.Renderer(model, 16, 16).render()
+"""
+
+
+class Finding(NamedTuple):
+    """Result of one check."""
+
+    name: str
+    state: str
+    """``ok``, ``warn`` or ``FAIL``."""
+    detail: str
+
+
+def check_packages() -> list[Finding]:
+    """Each required package, its version, and whether it is in the range that setup.py allows."""
+    try:
+        needed = [Requirement(text) for text in requires("eagle-rl") or []]
+    except PackageNotFoundError:
+        return [Finding("eagle-rl", "FAIL", "not installed; run make setup, or pip install -e .")]
+    findings = []
+    for requirement in needed:
+        if requirement.marker is None or requirement.marker.evaluate({"extra": ""}):
+            found = installed_version(requirement.name)
+            good = found != "missing" and requirement.specifier.contains(found, prereleases=True)
+            wanted = "" if good else f", needs {requirement.specifier}; run make setup"
+            findings.append(Finding(requirement.name, "ok" if good else "FAIL", found + wanted))
+    return findings
+
+
+def check_machine() -> list[Finding]:
+    """Python, operating system and cores that this process may use."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    threads = os.environ.get("OMP_NUM_THREADS", "not set")
+    return [
+        Finding("python", "ok", f"{platform.python_version()} on {platform.platform()}"),
+        Finding("cores", "ok", f"{cores} usable; OMP_NUM_THREADS {threads}; physics uses all, torch run.torch_threads"),
+    ]
+
+
+def check_data() -> list[Finding]:
+    """Whether every shipped robot and experiment loads."""
+    from envs.robots.load import load_robot
+
+    findings = []
+    for kind, load in (("robots", load_robot), ("experiment", load_experiment)):
+        names = known_names(kind)
+        faults = [fault for name in names if (fault := _fault(load, name))]
+        state = "ok" if names and not faults else "FAIL"
+        findings.append(Finding(kind, state, "; ".join(faults) or f"{', '.join(names) or 'none'} in {data_root()}"))
+    return findings
+
+
+def _fault(load: Callable[[str], object], name: str) -> str:
+    try:
+        load(name)
+    except EagleError as error:
+        return str(error)
+    return ""
+
+
+def check_graphics() -> list[Finding]:
+    """Whether pictures can be rendered without a display; tried in another process, for a bad driver may kill it."""
+    backend = os.environ.get("MUJOCO_GL", "egl")
+    command = [sys.executable, "-c", _RENDER]
+    try:
+        done = subprocess.run(
+            command, env={**os.environ, "MUJOCO_GL": backend}, capture_output=True, timeout=60, check=False
+        )
+        good = done.returncode == 0
+    except subprocess.TimeoutExpired:
+        good = False
+    advice = "no offscreen rendering: videos need EGL; on Debian: apt install libegl1 libgl1-mesa-dri"
+    return [Finding("graphics", "ok" if good else "warn", f"offscreen by {backend}" if good else advice)]
+
+
+def check_folder() -> list[Finding]:
+    """Whether run directories can be made here."""
+    try:
+        with tempfile.TemporaryDirectory(dir=Path.cwd(), prefix=".doctor-"):
+            return [Finding("folder", "ok", f"{Path.cwd()} can be written")]
+    except OSError as error:
+        return [Finding("folder", "warn", f"{Path.cwd()}: {error.strerror}; train with --out DIR")]
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run ``eagle doctor``; 2 if something is missing without which nothing works."""
+    argparse.ArgumentParser(prog="eagle doctor", description=__doc__).parse_args(argv)
+    findings: list[Finding] = []
+    for check in (check_machine, check_packages, check_data, check_graphics, check_folder):
+        findings += check()
+    for finding in findings:
+        print(f"{finding.state:<4}  {finding.name:<16} {finding.detail}")
+    failed = sum(finding.state == "FAIL" for finding in findings)
+    print(f"\n{failed} of {len(findings)} checks failed" if failed else "\nall in order")
+    return 2 if failed else 0

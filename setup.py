@@ -1,0 +1,95 @@
+"""Packaging. ``cfg`` and ``assets`` live at the top of the repository and travel in the package as ``eagle_rl/data``."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+
+from setuptools import find_packages, setup
+from setuptools.command.build_py import build_py
+
+ROOT = Path(__file__).resolve().parent
+DATA_FOLDERS = ("cfg", "assets")
+
+
+class BuildWithData(build_py):
+    """Copy the data folders into the package being built; ``eagle_rl.paths.data_root`` finds them there."""
+
+    def run(self) -> None:
+        super().run()
+        if self.editable_mode:
+            return
+        for name in DATA_FOLDERS:
+            target = Path(self.build_lib) / "eagle_rl" / "data" / name
+            shutil.rmtree(target, ignore_errors=True)
+            shutil.copytree(ROOT / name, target)
+
+
+def version() -> str:
+    """The version, written once in ``eagle_rl/_version.py``."""
+    match = re.search(r'__version__ = "(.+)"', (ROOT / "eagle_rl" / "_version.py").read_text(encoding="utf-8"))
+    if match is None:
+        raise RuntimeError("eagle_rl/_version.py holds no version")
+    return match.group(1)
+
+
+setup(
+    name="eagle-rl",
+    version=version(),
+    description="One whole-body controller for a mixed fleet of humanoids: generalist-specialist distillation on CPU",
+    long_description=(ROOT / "README.md").read_text(encoding="utf-8"),
+    long_description_content_type="text/markdown",
+    license="Apache-2.0",
+    python_requires=">=3.10,<3.14",
+    packages=find_packages(include=["eagle_rl", "eagle_rl.*", "envs", "envs.*"]),
+    cmdclass={"build_py": BuildWithData},
+    scripts=["train.py", "play.py"],
+    entry_points={"console_scripts": ["eagle = eagle_rl.cli.main:main"]},
+    install_requires=[
+        "torch>=2.4",
+        "rsl-rl-lib>=5.5.1,<5.6",
+        "tensordict>=0.7",
+        "mujoco>=3.17",
+        "pin>=3,<5",
+        "gymnasium>=1.0",
+        "numpy>=1.26",
+        "typing_extensions>=4.5",
+        "tensorboard>=2.14",
+        "packaging>=22.0",
+        "PyYAML>=6.0",
+        "rich>=13.0",
+        "imageio>=2.30",
+        "imageio-ffmpeg>=0.4.9",
+        "matplotlib>=3.8",
+        "scikit-learn>=1.3",
+        "safetensors>=0.4",
+        "onnx>=1.16",
+        "onnxscript>=0.2",
+        "onnxruntime>=1.17",
+    ],
+    extras_require={
+        "dev": [
+            "build>=1.0",
+            "setuptools>=68",
+            "wheel>=0.40",
+            "pytest>=8.0",
+            "pytest-cov>=5.0",
+            "pytest-xdist>=3.5",
+            "hypothesis>=6.100",
+            "ruff>=0.12",
+            "mypy>=1.13",
+            "types-PyYAML>=6.0",
+        ],
+        "viewer": ["viser>=0.2"],
+        "wandb": ["wandb>=0.17"],
+    },
+    classifiers=[
+        "Programming Language :: Python :: 3",
+        "Programming Language :: Python :: 3.10",
+        "Programming Language :: Python :: 3.11",
+        "Programming Language :: Python :: 3.12",
+        "Programming Language :: Python :: 3.13",
+        "Topic :: Scientific/Engineering :: Artificial Intelligence",
+    ],
+)
