@@ -13,9 +13,12 @@ from numpy.typing import NDArray
 
 from eagle_rl.errors import EagleError
 
-from .scene import Array, CameraCfg, FollowCamera, Stage
+from ..robots.spec import Array
+from .scene import CameraCfg, FollowCamera, Stage
 
 Frame = NDArray[np.uint8]
+
+_LABEL_RGBA = np.array([0.15, 0.2, 0.28, 1.0], np.float32)
 
 _HELP = (
     "Pictures need OpenGL without a display, and this machine has neither EGL nor OSMesa that works: install one, "
@@ -104,11 +107,22 @@ class OffscreenRenderer:
             mujoco.mjtCatBit.mjCAT_ALL.value,
             self._scene,
         )
+        self._add_labels()
         rect = mujoco.MjrRect(0, 0, self.width, self.height)
         mujoco.mjr_render(rect, self._scene, self._gl)
         pixels = np.empty((self.height, self.width, 3), np.uint8)
         mujoco.mjr_readPixels(pixels, None, rect, self._gl)
         return np.flipud(pixels)
+
+    def _add_labels(self) -> None:
+        """Write each robot's name above its head."""
+        for name, position in zip(self.stage.names, self.stage.label_positions(), strict=True):
+            label = self._scene.geoms[self._scene.ngeom]
+            mujoco.mjv_initGeom(
+                label, mujoco.mjtGeom.mjGEOM_LABEL, np.full(3, 0.1), position, np.eye(3).ravel(), _LABEL_RGBA
+            )
+            label.label = name
+            self._scene.ngeom += 1
 
 
 def picture(stage: Stage, qpos: list[Array], width: int = 1280, height: int = 720) -> Frame:

@@ -10,11 +10,13 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from eagle_rl.config.schema import SimCfg
 
-LANE_WIDTH = 1.4
+from ..robots.model import build_spec, set_options
+from ..robots.spec import Array, RobotSpec
+
+LANE_WIDTH = 1.25
 """Distance between neighbouring robots [m]."""
 
 _SKY_TOP, _SKY_BOTTOM = (0.55, 0.70, 0.88), (0.93, 0.96, 0.99)
@@ -25,13 +27,13 @@ _TILE_LIGHT, _TILE_DARK = (0.80, 0.83, 0.86), (0.66, 0.71, 0.76)
 class CameraCfg:
     """Where the picture is taken from: a point that follows the robots' mean position at a constant bearing."""
 
-    azimuth_deg: float = 198.0
+    azimuth_deg: float = 193.0
     """Viewing direction about z [deg]; 180 looks at the robots' faces, more is from their left."""
-    elevation_deg: float = -9.0
+    elevation_deg: float = -8.0
     """Viewing direction above the horizon [deg]."""
     margin: float = 1.0
     """Distance as a multiple of the least that shows the whole line [-]."""
-    height: float = 0.8
+    height: float = 0.85
     """Height of the point looked at [m]."""
 
 
@@ -41,27 +43,24 @@ class Stage:
     Attributes:
         model: the compiled model.
         data: its state; ``pose`` writes it.
-        names: robot names, in lane order from the robots' left to their right.
+        names: robot names, in the order of their lanes, from left to right in the picture.
     """
 
-    def __init__(self, names: Sequence[str], robots: Sequence[mujoco.MjSpec]) -> None:
-        """Attach each robot to its lane.
-
-        Args:
-            names: one name per robot, unique.
-            robots: one uncompiled model per robot, whose first body carries the free joint; models are copied, and
-                only their bodies are used (no floor, no actuators).
-        """
-        self.names = tuple(names)
-        spec = _empty_stage()
-        for name, robot, lane in zip(names, robots, lanes(len(names)), strict=True):
-            frame = spec.worldbody.add_frame(pos=[0.0, lane, 0.0])
-            frame.attach_body(robot.copy().worldbody.first_body(), f"{name}/", "")
-        self.model = spec.compile()
+    def __init__(self, specs: Sequence[RobotSpec]) -> None:
+        """Put each robot, with the shapes that only show, into its lane in its default pose; no robot twice."""
+        self.names = tuple(spec.name for spec in specs)
+        self._lanes = lanes(len(specs))
+        world, sim = _empty_stage(), SimCfg()
+        set_options(world, sim)
+        for spec, lane in zip(specs, self._lanes, strict=True):
+            frame = world.worldbody.add_frame(pos=[0.0, lane, 0.0])
+            frame.attach_body(build_spec(spec, sim, visuals=True).worldbody.first_body(), f"{spec.name}/", "")
+        self.model = world.compile()
         self.data = mujoco.MjData(self.model)
-        roots = [joint for joint in range(self.model.njnt) if self.model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE]
-        starts = [int(self.model.jnt_qposadr[joint]) for joint in roots]
-        self._slices = [slice(a, b) for a, b in zip(starts, [*starts[1:], self.model.nq], strict=True)]
+        ends = np.cumsum([7 + spec.num_joints for spec in specs]).tolist()
+        self._parts = [slice(end - 7 - spec.num_joints, end) for end, spec in zip(ends, specs, strict=True)]
+        self.pose([default_qpos(spec) for spec in specs])
+        self._label_heights = [self._top(name) + 0.3 for name in self.names]
 
     def pose(self, qpos: Sequence[Array]) -> None:
         """Show each robot in its own configuration.
@@ -69,16 +68,26 @@ class Stage:
         Args:
             qpos: per robot, root position [m], quaternion (w, x, y, z) and joint angles [rad] in native order.
         """
-        for part, lane, values in zip(self._slices, lanes(len(self.names)), qpos, strict=True):
+        for part, lane, values in zip(self._parts, self._lanes, qpos, strict=True):
             self.data.qpos[part] = values
             self.data.qpos[part.start + 1] += lane
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_comPos(self.model, self.data)
+        self.model.light_pos[0, :2] = self.root_positions()[:, :2].mean(axis=0)
         mujoco.mj_camlight(self.model, self.data)
 
     def root_positions(self) -> Array:
         """Where the robots' roots are on the stage [m], shape (num_robots, 3)."""
-        return np.array([self.data.qpos[part.start : part.start + 3] for part in self._slices])
+        return np.array([self.data.qpos[part.start : part.start + 3] for part in self._parts])
+
+    def label_positions(self) -> Array:
+        """Points above the robots' heads [m], shape (num_robots, 3)."""
+        return np.column_stack([self.root_positions()[:, :2], self._label_heights])
+
+    def _top(self, name: str) -> float:
+        """Height of a robot's highest shape [m]."""
+        bodies = [i for i in range(self.model.nbody) if self.model.body(i).name.startswith(f"{name}/")]
+        return float(self.data.geom_xpos[np.isin(self.model.geom_bodyid, bodies), 2].max())
 
 
 class FollowCamera:
@@ -99,9 +108,14 @@ class FollowCamera:
         self.camera.lookat = [*self._centre, self._height]
 
 
+def default_qpos(spec: RobotSpec) -> Array:
+    """A robot's default pose, feet on the ground: root position, quaternion and native joint angles."""
+    return np.concatenate([[0.0, 0.0, spec.nominal_height, 1.0, 0.0, 0.0, 0.0], spec.default_joint_pos])
+
+
 def lanes(num_robots: int) -> Array:
-    """Lateral position of each robot's lane [m], centred on zero, first robot leftmost, shape (num_robots,)."""
-    return LANE_WIDTH * (0.5 * (num_robots - 1) - np.arange(num_robots))
+    """Lateral position of each robot's lane [m], centred on zero, the first robot leftmost in the picture, shape (num_robots,)."""
+    return LANE_WIDTH * (np.arange(num_robots) - 0.5 * (num_robots - 1))
 
 
 def _distance(num_robots: int, aspect: float, fovy_deg: float) -> float:
@@ -118,10 +132,10 @@ def _empty_stage() -> mujoco.MjSpec:
     spec.visual.global_.fovy = 30.0
     spec.visual.quality.shadowsize = 4096
     spec.visual.quality.offsamples = 4
-    spec.visual.headlight.ambient = [0.35, 0.35, 0.36]
+    spec.visual.headlight.ambient = [0.42, 0.42, 0.43]
     spec.visual.headlight.diffuse = [0.30, 0.30, 0.30]
     spec.visual.headlight.specular = [0.0, 0.0, 0.0]
-    spec.visual.map.shadowclip = 4.0
+    spec.visual.map.shadowclip = 2.0
     spec.visual.rgba.haze = [*_SKY_BOTTOM, 1.0]
     spec.stat.extent = 4.0
     spec.add_texture(
@@ -137,9 +151,9 @@ def _empty_stage() -> mujoco.MjSpec:
     spec.worldbody.add_light(
         type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
         mode=mujoco.mjtCamLight.mjCAMLIGHT_FIXED,
-        pos=[2.0, 2.0, 6.0],
+        pos=[0.0, 0.0, 6.0],
         dir=[-0.35, -0.45, -1.0],
-        diffuse=[0.55, 0.54, 0.52],
+        diffuse=[0.50, 0.49, 0.47],
         specular=[0.15, 0.15, 0.15],
         castshadow=True,
     )

@@ -1,0 +1,78 @@
+"""Command scripts: what robots are told to do over time, one format for videos, regression and sim2sim.
+
+A YAML list of ``{t, vx, vy, wz, h, p}``. ``t`` is the time [s] from which the entry holds; what an entry leaves out is
+zero. ``vx, vy`` [m/s] and ``wz`` [rad/s] are in the base's heading frame, ``h`` [m] is the offset from the robot's
+nominal height, ``p`` [rad] the body pitch, positive forward. Changes are blended over ``BLEND_S``.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eagle_rl.errors import ConfigError, did_you_mean
+
+from .compose import find_file
+from .yaml_file import Node, parse_yaml, read_text
+
+Array = NDArray[np.float64]
+
+COMMAND_KEYS = ("vx", "vy", "wz", "h", "p")
+"""Keys of an entry, in the order of the command (v_x, v_y, omega, h, p)."""
+BLEND_S = 0.3
+"""Time over which one command turns into the next [s]."""
+HOLD_S = 2.0
+"""How long the last entry is shown [s]."""
+
+
+@dataclass(frozen=True, eq=False)
+class CommandScript:
+    """Commands over time."""
+
+    times: Array
+    """Start of each entry [s], rising from 0, shape (n,)."""
+    commands: Array
+    """(v_x, v_y, omega, h, p) [m/s, m/s, rad/s, m, rad] of each entry, shape (n, 5)."""
+    blend_s: float = BLEND_S
+
+    @property
+    def duration(self) -> float:
+        """End of the script [s]: the last entry is held for ``HOLD_S``."""
+        return float(self.times[-1]) + HOLD_S
+
+    def at(self, t: float) -> Array:
+        """Command in force at time ``t`` [s], shape (5,)."""
+        index = max(0, int(np.searchsorted(self.times, t, side="right")) - 1)
+        if index == 0:
+            return self.commands[0].copy()
+        elapsed = t - self.times[index]
+        share = min(1.0, elapsed / self.blend_s) if self.blend_s > 0 else 1.0
+        return (1.0 - share) * self.commands[index - 1] + share * self.commands[index]
+
+
+def load_commands(name_or_path: str) -> CommandScript:
+    """A script by the name of a file in ``cfg/commands``, or by path.
+
+    Raises:
+        ConfigError: lists everything that is wrong with it.
+    """
+    path = find_file("commands", name_or_path)
+    return parse_commands(read_text(path), str(path))
+
+
+def parse_commands(text: str, source: str = "commands") -> CommandScript:
+    """A script from YAML text; ``source`` names it in messages."""
+    entries = parse_yaml(text, source)
+    if not isinstance(entries.value, list) or not entries.value:
+        raise ConfigError(f"{source}: expected a list of entries such as `- {{t: 0, vx: 0.5}}`.")
+    faults: list[str] = []
+    rows = [_entry(entry, faults) for entry in entries.items]
+    times = np.array([row[0] for row in rows])
+    faults += _faults_of_times(times, entries.items)
+    if faults:
+        raise ConfigError(faults)
+    return CommandScript(times, np.array([row[1:] for row in rows]))
