@@ -8,9 +8,10 @@ from typing import Any
 
 import pytest
 import torch
-from hypothesis import settings
+from hypothesis import Phase, settings
 
-settings.register_profile("eagle", derandomize=True, deadline=None, database=None, print_blob=False)
+phases = [Phase.explicit, Phase.generate, Phase.shrink]
+settings.register_profile("eagle", derandomize=True, deadline=None, database=None, print_blob=False, phases=phases)
 settings.load_profile("eagle")
 torch.set_num_threads(1)
 

@@ -104,9 +104,7 @@ class EaglePPO(PPO):
                 Kickstart(lambda: cfg.kickstart_coef * math.exp(-cfg.kickstart_decay * self.num_updates))
             )
 
-    def process_env_step(
-        self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: Mapping[str, Any]
-    ) -> None:
+    def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: Mapping[str, Any]) -> None:
         """Record one step; a time-out is bootstrapped with the value of its true final observation."""
         ids = extras["final_ids"].to(self.device)
         if len(ids):

@@ -84,8 +84,6 @@ def convert(value: Any, hint: Any) -> Any:
         _MismatchError: the value is of another kind; nothing is guessed (no number from text, no bool from 0).
     """
     origin = get_origin(hint)
-    if origin is tuple and len(set(args)) == 1:
-        return f"a list of {len(args)} {_PLURALS[args[0]]}"
     if origin is tuple:
         return _sequence(value, hint)
     if origin in (Union, types.UnionType):

@@ -9,8 +9,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from eagle_rl.errors import ConfigError, RobotError, did_you_mean
 from eagle_rl.paths import shown
 
@@ -18,7 +16,7 @@ from .build import build
 from .compose import find_file, known_names, layer, load_file, parse_overrides
 from .schema import ExperimentCfg
 from .validate import find_faults
-from .yaml_file import Node, read_yaml
+from .yaml_file import Node, read_yaml, write_yaml
 
 
 def load_experiment(name_or_path: str, overrides: Sequence[str] = (), scale: str | None = None) -> ExperimentCfg:
@@ -79,7 +77,7 @@ def _plain(value: Any) -> Any:
 
 def to_yaml(cfg: ExperimentCfg) -> str:
     """The resolved configuration: every value, readable again by ``load_experiment``."""
-    return yaml.safe_dump(_plain(cfg), sort_keys=False, default_flow_style=None, width=120, allow_unicode=True)
+    return write_yaml(_plain(cfg))
 
 
 def config_hash(cfg: ExperimentCfg) -> str:

@@ -59,13 +59,18 @@ class _StrictLoader(yaml.SafeLoader):
         return node
 
 
+class _StrictDumper(yaml.SafeDumper):
+    """SafeDumper that quotes every text which either set of rules would read as something else."""
+
+
 for _tag, _pattern, _first in (
     ("bool", r"true|false|True|False", "tTfF"),
     ("null", r"~|null|", "~n"),
     ("int", r"[-+]?(?:0|[1-9][0-9_]*)", "-+0123456789"),
     ("float", r"[-+]?(?:[0-9][0-9_]*\.?[0-9_]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?|[-+]?\.inf|\.nan", "-+.0123456789"),
 ):
-    _StrictLoader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"^(?:{_pattern})$"), [*_first, ""])
+    for _class in (_StrictLoader, _StrictDumper):
+        _class.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"^(?:{_pattern})$"), [*_first, ""])
 
 
 def _line(node: yaml.Node, source: str, single_line: bool) -> str:
@@ -132,6 +137,13 @@ def read_yaml(path: Path) -> Node:
     if not isinstance(node.value, dict):
         raise ConfigError(f"{source}: expected keys and values at the top level, got {type(node.value).__name__}.")
     return node
+
+
+def write_yaml(value: Any) -> str:
+    """Plain values as YAML that ``parse_yaml`` reads back unchanged."""
+    return yaml.dump(
+        value, Dumper=_StrictDumper, sort_keys=False, default_flow_style=None, width=120, allow_unicode=True
+    )
 
 
 def to_plain(node: Node) -> Any:

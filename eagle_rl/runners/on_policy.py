@@ -145,15 +145,19 @@ class EagleRunner(OnPolicyRunner):
         self.env_steps += steps
         self.wall_time += learned - start
         std = self.alg.actor.output_std
-        return self.logger.collect() | losses | {
-            "Loss/learning_rate": self.alg.learning_rate,
-            "Policy/mean_std": (std.sum() / (std > 0).sum()).item(),
-            "Perf/total_fps": steps / (learned - start),
-            "Perf/collection_time": collected - start,
-            "Perf/learning_time": learned - collected,
-            "Perf/env_steps": self.env_steps,
-            "Perf/wall_time": self.wall_time,
-        }
+        return (
+            self.logger.collect()
+            | losses
+            | {
+                "Loss/learning_rate": self.alg.learning_rate,
+                "Policy/mean_std": (std.sum() / (std > 0).sum()).item(),
+                "Perf/total_fps": steps / (learned - start),
+                "Perf/collection_time": collected - start,
+                "Perf/learning_time": learned - collected,
+                "Perf/env_steps": self.env_steps,
+                "Perf/wall_time": self.wall_time,
+            }
+        )
 
     def _step(self) -> None:
         """One control step of every environment."""

@@ -195,7 +195,7 @@ def test_only_an_unknown_robot_is_a_robots_fault():
         ("base: pppo\n", "mine.yaml:1: no experiment named 'pppo'. Did you mean ppo?"),
         ("base: [ppo]\n", "mine.yaml:1: base: got ['ppo'], expected the name of a file."),
         ("base: mine.yaml\n", "base files run in a circle"),
-        ("a: 1\n---\nb: 1\n", "single document"),
+        ("a: 1\n---\nb: 1\n", "but found another document"),
         ("seed: " + "9" * 5000, "mine.yaml"),
     ],
 )
