@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eagle_rl.errors import ConfigError, did_you_mean
+from eagle_rl.paths import shown
 
 from .compose import find_file
 from .yaml_file import Node, parse_yaml, read_text
@@ -61,7 +62,7 @@ def load_commands(name_or_path: str) -> CommandScript:
         ConfigError: lists everything that is wrong with it.
     """
     path = find_file("commands", name_or_path)
-    return parse_commands(read_text(path), str(path))
+    return parse_commands(read_text(path), shown(path))
 
 
 def parse_commands(text: str, source: str = "commands") -> CommandScript:
@@ -76,3 +77,40 @@ def parse_commands(text: str, source: str = "commands") -> CommandScript:
     if faults:
         raise ConfigError(faults)
     return CommandScript(times, np.array([row[1:] for row in rows]))
+
+
+def _entry(node: Node, faults: list[str]) -> list[float]:
+    """Time and command of an entry; faults are added to the list."""
+    if not isinstance(node.value, dict):
+        faults.append(f"{node.where}: expected {{t: ..., vx: ..., ...}}, got {node.value!r}.")
+        return [math.nan] * (1 + len(COMMAND_KEYS))
+    known = ("t", *COMMAND_KEYS)
+    faults += [
+        f"{value.where}: {key}: no such key.{did_you_mean(key, known)} Known: {', '.join(known)}."
+        for key, value in node.children.items()
+        if key not in known
+    ]
+    if "t" not in node.children:
+        faults.append(f"{node.where}: t: missing; expected the time [s] from which this entry holds.")
+    return [_number(key, node.children[key], faults) if key in node.children else 0.0 for key in known]
+
+
+def _number(key: str, node: Node, faults: list[str]) -> float:
+    value = node.value
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        faults.append(f"{node.where}: {key}: got {value!r}, expected a finite number.")
+        return math.nan
+    return float(value)
+
+
+def _faults_of_times(times: Array, nodes: list[Node]) -> list[str]:
+    """What is wrong with the order of the entries."""
+    faults = []
+    if times[0] != 0 and not math.isnan(times[0]):
+        faults.append(f"{nodes[0].where}: t: got {times[0]:g}, expected 0 in the first entry.")
+    faults += [
+        f"{nodes[i].where}: t: got {times[i]:g}, expected at least {BLEND_S:g} s after the entry before ({times[i - 1]:g})."
+        for i in range(1, len(times))
+        if times[i] - times[i - 1] < BLEND_S - 1e-9
+    ]
+    return faults

@@ -135,7 +135,7 @@ def _empty_stage() -> mujoco.MjSpec:
     spec.visual.headlight.ambient = [0.42, 0.42, 0.43]
     spec.visual.headlight.diffuse = [0.30, 0.30, 0.30]
     spec.visual.headlight.specular = [0.0, 0.0, 0.0]
-    spec.visual.map.shadowclip = 2.0
+    spec.visual.map.shadowclip = 2.5
     spec.visual.rgba.haze = [*_SKY_BOTTOM, 1.0]
     spec.stat.extent = 4.0
     spec.add_texture(
@@ -151,7 +151,7 @@ def _empty_stage() -> mujoco.MjSpec:
     spec.worldbody.add_light(
         type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
         mode=mujoco.mjtCamLight.mjCAMLIGHT_FIXED,
-        pos=[0.0, 0.0, 6.0],
+        pos=[0.0, 0.0, 4.0],
         dir=[-0.35, -0.45, -1.0],
         diffuse=[0.50, 0.49, 0.47],
         specular=[0.15, 0.15, 0.15],
