@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes.util
 import os
+from collections.abc import Sequence
 from types import TracebackType
 from typing import Protocol, Self
 
@@ -94,9 +95,13 @@ class OffscreenRenderer:
         self._gl.free()
         self._context.free()
 
-    def frame(self) -> Frame:
-        """A picture of the stage as it is posed, RGB, shape (height, width, 3)."""
+    def show(self, qpos: Sequence[Array]) -> None:
+        """Pose the robots, see :meth:`Stage.pose`, and let the camera glide on."""
+        self.stage.pose(qpos)
         self.camera.follow(self.stage.root_positions())
+
+    def frame(self) -> Frame:
+        """A picture of what is shown, RGB, shape (height, width, 3)."""
         self._context.make_current()
         mujoco.mjv_updateScene(
             self.stage.model,
@@ -123,10 +128,3 @@ class OffscreenRenderer:
             )
             label.label = name
             self._scene.ngeom += 1
-
-
-def picture(stage: Stage, qpos: list[Array], width: int = 1280, height: int = 720) -> Frame:
-    """One frame of the robots in the given configurations."""
-    with OffscreenRenderer(stage, width, height) as renderer:
-        stage.pose(qpos)
-        return renderer.frame()

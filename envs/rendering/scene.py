@@ -101,8 +101,8 @@ class FollowCamera:
         self._height = cfg.height
         self._centre: Array | None = None
 
-    def follow(self, roots: Array, smoothing: float = 0.9) -> None:
-        """Move towards the mean of the root positions, shape (num_robots, 3) [m]."""
+    def follow(self, roots: Array, smoothing: float = 0.97) -> None:
+        """Move towards the mean of the root positions, shape (num_robots, 3) [m]; call once per control step."""
         target = roots[:, :2].mean(axis=0)
         self._centre = target if self._centre is None else smoothing * self._centre + (1 - smoothing) * target
         self.camera.lookat = [*self._centre, self._height]
@@ -132,6 +132,7 @@ def _empty_stage() -> mujoco.MjSpec:
     spec.visual.global_.fovy = 30.0
     spec.visual.quality.shadowsize = 4096
     spec.visual.quality.offsamples = 4
+    spec.visual.quality.numslices, spec.visual.quality.numstacks = 18, 9
     spec.visual.headlight.ambient = [0.42, 0.42, 0.43]
     spec.visual.headlight.diffuse = [0.30, 0.30, 0.30]
     spec.visual.headlight.specular = [0.0, 0.0, 0.0]
