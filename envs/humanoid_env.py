@@ -17,8 +17,8 @@ from .geometry import rotate_inverse
 from .mdp.aids import LearningAids, harness_damping, harness_wrench
 from .mdp.commands import CommandSampler
 from .mdp.curriculum import penalty_scale
-from .mdp.gait import advance_phase, clock, contact_probability, foot_phases
-from .mdp.metrics import tracking_errors
+from .mdp.gait import advance_phase, clock, foot_phases
+from .mdp.metrics import contact_match, tracking_errors
 from .mdp.observations import (
     History,
     ObservationLayout,
@@ -34,7 +34,7 @@ from .mdp.rewards import RewardContext, compute_rewards, success_scores
 from .mdp.terminations import terminations
 from .pooling import pool_robots, share
 from .rng import CounterRng
-from .robots.embodiment import embodiment_dim, pooled_embodiment
+from .robots.embodiment import pooled_embodiment
 from .robots.model import build_model
 from .robots.sensors import SENSOR_SLICES
 from .robots.slots import NUM_SLOTS
@@ -105,9 +105,7 @@ class HumanoidEnv(VecEnv):
             if observations.embodiment_observation
             else None
         )
-        self.layout = ObservationLayout(
-            observations, embodiment_dim(observations.descriptor) if self.embodiment is not None else 0
-        )
+        self.layout = ObservationLayout(observations)
         self.mirror = self.layout.mirror(self.device)
         self._noise = noise_scale(observations, self.robots)
         self._log = StepLog(self.robot_names, self.robots.robot_id)
@@ -193,6 +191,7 @@ class HumanoidEnv(VecEnv):
         self._pinned = command
         if command is not None:
             self._set_commands(self._all, command.to(self.command))
+            self._show_commands()
 
     @property
     def penalty_scale(self) -> float:
@@ -331,8 +330,12 @@ class HumanoidEnv(VecEnv):
         ids = ((self.episode_length_buf % interval == 0) & (self.episode_length_buf > 0)).nonzero().squeeze(1)
         if len(ids):
             self._draw_commands(ids)
-            self.state.command, self.state.standing = self.command, self.standing
-            self.state.foot_phase = foot_phases(self.phase, self.standing, self.task.gait)
+            self._show_commands()
+
+    def _show_commands(self) -> None:
+        """Let the present state, and so the next observation, show the commands now in force."""
+        self.state.command, self.state.standing = self.command, self.standing
+        self.state.foot_phase = foot_phases(self.phase, self.standing, self.task.gait)
 
     def _draw_commands(self, ids: Tensor) -> None:
         if self._pinned is not None:
@@ -349,15 +352,14 @@ class HumanoidEnv(VecEnv):
 
     def _account(
         self, terms: dict[str, Tensor], reasons: dict[str, Tensor], dones: Tensor, time_outs: Tensor
-    ) -> dict[str, Tensor]:
+    ) -> dict[str, Tensor | float]:
         """Add the step to the log and the aids; returns tags and values once per ``LOG_INTERVAL``."""
-        stance = contact_probability(self.state.foot_phase, self.task.gait) > 0.5
-        match = (self.state.foot_contact == stance).to(self.command.dtype).mean(dim=1)
+        match = contact_match(self.state, self.task.gait)
         self._log.add(terms, reasons, self.tracking_errors(), match, dones & ~time_outs, dones, self.state.standing)
         if self.common_step_counter % LOG_INTERVAL:
             return {}
-        entry, falls_per_step, contact_match = self._log.flush()
-        self.aids.update(episode_ratio(falls_per_step, self.max_episode_length), contact_match)
+        entry, falls_per_step, match_per_robot = self._log.flush()
+        self.aids.update(episode_ratio(falls_per_step, self.max_episode_length), match_per_robot)
         self._set_harness_damping()
         k = torch.tensor(self.penalty_scale)
         return entry | self.commands.log() | self.aids.log(self.robot_names) | {"Curriculum/penalty_scale": k}

@@ -14,7 +14,7 @@ from envs.mdp.symmetry import mirror_robots
 from envs.robots.slots import MIRROR_PERMUTATION, NUM_SLOTS
 from envs.state import PooledRobots, PooledState
 
-NUM_SCAN_POINTS = ObservationLayout(ObservationsCfg(), 0).num_scan_points
+NUM_SCAN_POINTS = ObservationLayout(ObservationsCfg()).num_scan_points
 
 
 def random_robots(seed: int, num_envs: int = 8, num_robots: int = 2, symmetric: bool = False) -> PooledRobots:

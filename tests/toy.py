@@ -1,7 +1,8 @@
 """A stand-in for the simulator: three robots must bring their pitch joints to the command, the others to zero.
 
 ``x' = x + 0.1 a / m`` for the joints a robot has; the mass m is seen by the critic and must be estimated by the actor.
-The task is its own mirror image. It honours the whole interface of the humanoid environment, and its random numbers are its own.
+The task is its own mirror image. It honours the whole interface of the humanoid environment; its random numbers are its
+own.
 """
 
 from __future__ import annotations

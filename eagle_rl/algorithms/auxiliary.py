@@ -54,8 +54,8 @@ class Mirror:
         rows = max(1, round(self.fraction * len(obs)))
         mask = obs["slot_mask"][:rows]
         perm, sign = self.maps["actions"]
-        mirrored = (obs[group][:rows][:, self.maps[group][0]] * self.maps[group][1] for group in ACTOR_INPUTS)
-        mean_of_mirrored = actor.mean_actions(*mirrored, mask[:, perm])
+        history, command, clock = (obs[g][:rows][:, self.maps[g][0]] * self.maps[g][1] for g in ACTOR_INPUTS)
+        mean_of_mirrored = actor.mean_actions(history, command, clock, mask[:, perm])
         loss = losses.mirror_loss(actor.output_mean[:rows], mean_of_mirrored, perm, sign, mask)
         log["Loss/mirror"] = loss
         return self.coef * loss

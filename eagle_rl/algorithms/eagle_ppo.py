@@ -78,7 +78,7 @@ class EaglePPO(PPO):
         self.skipped_steps = 0
         self._skipped_in_a_row = 0
         self.symmetry = AuxiliaryLosses([])
-        parameters = self.optimizer.param_groups[0]["params"]
+        parameters = [*actor.parameters(), *critic.parameters()]
         self.optimizer = torch.optim.Adam(parameters, lr=cfg.learning_rate, fused=True)
         self.optimizer.register_step_post_hook(lambda *_: self._raw_actor.distribution.project_std())
 
@@ -93,11 +93,11 @@ class EaglePPO(PPO):
             alg.symmetry.terms.append(Mirror(alg.cfg.mirror_coef, alg.cfg.mirror_fraction, env.mirror, device))
         return alg
 
-    def imitate(self, specialists: SpecialistBank, method: Literal["distill", "kickstarting"]) -> None:
+    def imitate(self, specialists: SpecialistBank, method: Literal["eagle", "kickstart"]) -> None:
         """From now on learn from ``specialists`` too."""
         self.specialists = specialists
         cfg = self.cfg
-        if method == "distill":
+        if method == "eagle":
             self.symmetry.terms.append(Distill(cfg.action_loss_coef, cfg.embedding_loss_coef, self.robot_names))
         else:
             self.symmetry.terms.append(

@@ -30,7 +30,7 @@ class SpecialistBank:
             observations: the generalist's rollout, batch size (T, N).
 
         Returns:
-            ``teacher_action`` and ``teacher_std`` (T, N, 32), zero in absent slots, and ``teacher_embedding`` (T, N, E).
+            ``teacher_action``, ``teacher_std`` (T, N, 32), zero in absent slots, and ``teacher_embedding`` (T, N, E).
         """
         chunks = [self._label_rows(rows) for rows in observations.flatten(0, 1).split(CHUNK_ROWS)]
         size = observations.batch_size

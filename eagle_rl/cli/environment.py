@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
 from eagle_rl.config.schema import RunCfg, TaskCfg
@@ -15,16 +16,17 @@ MakeEnv = Callable[[Sequence[str], int, TaskCfg, int], "VecEnv"]
 
 
 def make_env_factory(run: RunCfg) -> MakeEnv:
-    """The function by which runners build environments without knowing the simulation.
+    """The function by which runners build environments without knowing the simulation; it can be pickled.
 
     Args:
         run: device of the tensors and number of physics threads.
     """
+    return partial(_make_env, run)
+
+
+def _make_env(run: RunCfg, robots: Sequence[str], num_envs: int, task: TaskCfg, seed: int) -> VecEnv:
     from envs.humanoid_env import HumanoidEnv
     from envs.robots.load import load_robot
 
-    def make_env(robots: Sequence[str], num_envs: int, task: TaskCfg, seed: int) -> VecEnv:
-        specs = [load_robot(name) for name in robots]
-        return HumanoidEnv(task, specs, num_envs, seed, device=run.device, num_threads=run.num_threads)
-
-    return make_env
+    specs = [load_robot(name) for name in robots]
+    return HumanoidEnv(task, specs, num_envs, seed, device=run.device, num_threads=run.num_threads)

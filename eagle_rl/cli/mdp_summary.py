@@ -56,9 +56,9 @@ def _commands(cfg: CommandsCfg) -> Table:
 
 
 def _observations(cfg: ObservationsCfg) -> Table:
-    from envs.mdp.layout import EMBODIMENT_DIM, ObservationLayout
+    from envs.mdp.layout import ObservationLayout
 
-    layout = ObservationLayout(cfg, EMBODIMENT_DIM if cfg.embodiment_observation else 0)
+    layout = ObservationLayout(cfg)
     frame = layout.groups["history"][: len(layout.groups["history"]) // cfg.history_length]
     groups = {f"history x {cfg.history_length}": frame} | {
         name: layout.groups[name] for name in ("command", "clock", "critic", "estimate")

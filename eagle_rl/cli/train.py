@@ -12,6 +12,7 @@ from eagle_rl.config.compose import known_names
 from eagle_rl.config.load import config_hash, load_experiment, to_yaml
 from eagle_rl.config.schema import ExperimentCfg
 from eagle_rl.errors import ConfigError
+from eagle_rl.runners.provenance import Provenance, content_hash, slot_table_hash
 
 from .provenance import provenance
 from .run_directory import check_drift, create_run, open_run
@@ -33,6 +34,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--seed", type=int, metavar="N", help="the same as seed=N")
     parser.add_argument("--device", metavar="cpu|cuda", help="where the learner computes, the same as run.device=...")
     parser.add_argument("--scale", choices=known_names("scale"), help="lay cfg/scale/NAME.yaml over the experiment")
+    parser.add_argument("--jobs", type=int, default=1, metavar="K", help="train K specialists side by side [1]")
     parser.add_argument("--allow-drift", action="store_true", help="resume although versions, robots or values changed")
     parser.add_argument("--show", action="store_true", help="print the resolved configuration and stop")
     return parser
@@ -95,10 +97,18 @@ def main(argv: Sequence[str]) -> int:
         check_drift(args.resume, request.changes, record, args.allow_drift)
     _prepare_torch(cfg)
     run_dir = args.resume or create_run(cfg, args.out, record)
-    return _train(cfg, run_dir, resume=args.resume is not None)
+    return _train(cfg, run_dir, args, record)
 
 
-def _train(cfg: ExperimentCfg, run_dir: Path, *, resume: bool) -> int:
+def _identity(record: dict[str, Any]) -> Provenance:
+    """What checkpoints of the run belong to."""
+    from envs.robots.slots import SLOT_NAMES
+
+    robots = {name: content_hash(files) for name, files in record["robots"].items()}
+    return Provenance(robots=robots, slot_table_hash=slot_table_hash(SLOT_NAMES))
+
+
+def _train(cfg: ExperimentCfg, run_dir: Path, args: argparse.Namespace, record: dict[str, Any]) -> int:
     from rich.console import Console
 
     from eagle_rl.runners.stages import run_experiment
@@ -109,7 +119,16 @@ def _train(cfg: ExperimentCfg, run_dir: Path, *, resume: bool) -> int:
     console = Console()
     print_mdp(cfg.task, console)
     console.print(f"{cfg.name}: {cfg.description}\nrun directory: {run_dir}", highlight=False)
-    run_experiment(cfg, run_dir, make_env_factory(cfg.run), resume, console)
+    run_experiment(
+        cfg,
+        run_dir,
+        make_env_factory(cfg.run),
+        resume=args.resume is not None,
+        jobs=args.jobs,
+        console=console,
+        provenance=_identity(record),
+        allow_drift=args.allow_drift,
+    )
     console.print(
         f"\nWatch it:     eagle play {run_dir}\nMeasure it:   eagle evaluate {run_dir}\n"
         f"Curves:       tensorboard --logdir {run_dir}\nGo on:        eagle train --resume {run_dir}",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from .build import build
 from .compose import find_file, known_names, layer, load_file, parse_overrides
 from .schema import ExperimentCfg
 from .validate import find_faults
-from .yaml_file import Node, read_yaml, write_yaml
+from .yaml_file import Node, parse_yaml, read_yaml, write_yaml
 
 
 def load_experiment(name_or_path: str, overrides: Sequence[str] = (), scale: str | None = None) -> ExperimentCfg:
@@ -45,6 +45,23 @@ def load_experiment(name_or_path: str, overrides: Sequence[str] = (), scale: str
         raise ConfigError(faults + strangers)
     if strangers:
         raise RobotError("\n".join(strangers))
+    return cfg
+
+
+def experiment_from_plain(values: Mapping[str, Any], source: str) -> ExperimentCfg:
+    """The experiment whose resolved values were stored, such as those in a checkpoint's manifest.
+
+    Args:
+        values: plain nested values, as ``config.yaml`` holds them.
+        source: where they come from, for messages.
+
+    Raises:
+        ConfigError: they do not fit this version's schema; lists every fault.
+    """
+    faults: list[str] = []
+    cfg = build(ExperimentCfg(name="stored"), parse_yaml(json.dumps(values), source, single_line=True), faults)
+    if faults:
+        raise ConfigError(faults)
     return cfg
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from typing import Any, Self
+from typing import Any
 
 import torch
 from rsl_rl.models import MLPModel
@@ -78,7 +78,7 @@ class EagleActor(MLPModel):
         """Numbers from which :meth:`from_architecture` builds the same actor, without an environment."""
 
     @classmethod
-    def from_architecture(cls, architecture: dict[str, Any]) -> Self:
+    def from_architecture(cls, architecture: dict[str, Any]) -> EagleActor:
         """An untrained actor of the same shape."""
         dims = architecture["observations"]
         obs = TensorDict({group: torch.zeros(1, dim) for group, dim in dims.items()}, batch_size=[1])

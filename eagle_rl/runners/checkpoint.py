@@ -7,6 +7,7 @@ manifest last, so that whatever has a manifest was written completely.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import io
 import json
@@ -14,7 +15,7 @@ import os
 import re
 import warnings
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -150,25 +151,19 @@ def verify_checkpoint(path: Path) -> Manifest:
 
 def latest_checkpoint(folder: Path) -> Path | None:
     """The verified checkpoint of the highest iteration; damaged ones are passed over with a warning."""
-    for path in sorted(_data_files(folder), key=iteration_of, reverse=True):
-        try:
-            verify_checkpoint(path)
-        except CheckpointError as error:
-            warnings.warn(f"Passing over a checkpoint. {error}", stacklevel=2)
-        else:
-            return path
-    return None
+    newest_first = sorted(_data_files(folder), key=iteration_of, reverse=True)
+    return next((path for path in newest_first if _is_sound(path)), None)
 
 
 def best_checkpoint(folder: Path) -> Path | None:
     """The checkpoint with the highest score."""
-    scored = [(m["score"], path) for path, m in _manifests(folder) if m["score"] is not None]
+    scored = [(m["score"], path) for path, m in _manifests(folder).items() if m["score"] is not None]
     return max(scored, default=(None, None), key=lambda item: (item[0], iteration_of(item[1])))[1]
 
 
 def prune_checkpoints(folder: Path, keep: int) -> None:
     """Delete all but the last ``keep``, the best, and the ends of stages."""
-    manifests = dict(_manifests(folder))
+    manifests = _manifests(folder)
     last = sorted(manifests, key=iteration_of)[-keep:]
     for path in set(manifests) - {*last, best_checkpoint(folder)}:
         if not manifests[path]["stage_end"]:
@@ -212,13 +207,23 @@ def _data_files(folder: Path) -> list[Path]:
     return [path for path in Path(folder).glob("model_*.pt") if re.fullmatch(r"model_\d+", path.stem)]
 
 
-def _manifests(folder: Path) -> Iterator[tuple[Path, Manifest]]:
+def _is_sound(path: Path) -> bool:
+    """Whether a checkpoint passes :func:`verify_checkpoint`; warns if not."""
+    try:
+        verify_checkpoint(path)
+    except CheckpointError as error:
+        warnings.warn(f"Passing over a checkpoint. {error}", stacklevel=3)
+        return False
+    return True
+
+
+def _manifests(folder: Path) -> dict[Path, Manifest]:
     """Readable manifests of a folder, by data file."""
+    found = {}
     for path in _data_files(folder):
-        try:
-            yield path, read_manifest(path)
-        except CheckpointError:
-            continue
+        with contextlib.suppress(CheckpointError):
+            found[path] = read_manifest(path)
+    return found
 
 
 def _read_verified(path: Path, manifest: Manifest) -> bytes:

@@ -11,6 +11,7 @@ import json
 import os
 import socket
 import threading
+import time
 import uuid
 from pathlib import Path
 from types import TracebackType
@@ -47,6 +48,18 @@ def _is_stale(claim: Path, now: float) -> bool:
     except FileNotFoundError:
         return False
     return age > STALE_AFTER_S or (holder["host"] == socket.gethostname() and _process_is_dead(holder["pid"]))
+
+
+def holder(folder: Path) -> str | None:
+    """``host:pid`` of who works on a stage, None if nobody does."""
+    generations = _generations(folder)
+    if not generations or _is_stale(generations[-1][1], time.time()):
+        return None
+    try:
+        claim = json.loads(generations[-1][1].read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return None
+    return f"{claim['host']}:{claim['pid']}"
 
 
 class Claim:

@@ -7,7 +7,7 @@ import dataclasses
 import io
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -92,7 +92,12 @@ class EagleRunner(OnPolicyRunner):
 
     # --- training ---------------------------------------------------------------------------------------------------
 
-    def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = True) -> None:
+    def learn(
+        self,
+        num_learning_iterations: int,
+        init_at_random_ep_len: bool = True,
+        on_iteration: Callable[[int], None] = lambda iteration: None,
+    ) -> Path | None:
         """Train, then save.
 
         A first SIGINT or SIGTERM ends training after the iteration and raises :class:`Interrupted` once it is saved.
@@ -100,6 +105,10 @@ class EagleRunner(OnPolicyRunner):
         Args:
             num_learning_iterations: iterations to add to those done.
             init_at_random_ep_len: spread the ages of the first episodes, so that not all end at once.
+            on_iteration: told the number of iterations done after each.
+
+        Returns:
+            The final checkpoint; None where nothing is written.
         """
         last = self.current_learning_iteration + num_learning_iterations
         if init_at_random_ep_len and self.current_learning_iteration == 0:
@@ -117,6 +126,7 @@ class EagleRunner(OnPolicyRunner):
                     if self.gpu_global_rank == 0:
                         progress.update(self.current_learning_iteration, self.env_steps, scalars)
                     self._save_now_and_then(scalars)
+                    on_iteration(self.current_learning_iteration)
                     if self._any_process(interrupt.requested):
                         raise Interrupted(f"Interrupted after iteration {self.current_learning_iteration}.")
         except Interrupted:
@@ -128,7 +138,7 @@ class EagleRunner(OnPolicyRunner):
             raise
         finally:
             self.logger.close()
-        self.save(stage_end=True)
+        return self.save(stage_end=True)
 
     def _iterate(self) -> dict[str, float]:
         """Collect one rollout and learn from it; return the iteration's scalars by tag."""
@@ -145,19 +155,16 @@ class EagleRunner(OnPolicyRunner):
         self.env_steps += steps
         self.wall_time += learned - start
         std = self.alg.actor.output_std
-        return (
-            self.logger.collect()
-            | losses
-            | {
-                "Loss/learning_rate": self.alg.learning_rate,
-                "Policy/mean_std": (std.sum() / (std > 0).sum()).item(),
-                "Perf/total_fps": steps / (learned - start),
-                "Perf/collection_time": collected - start,
-                "Perf/learning_time": learned - collected,
-                "Perf/env_steps": self.env_steps,
-                "Perf/wall_time": self.wall_time,
-            }
-        )
+        own = {
+            "Loss/learning_rate": self.alg.learning_rate,
+            "Policy/mean_std": (std.sum() / (std > 0).sum()).item(),
+            "Perf/total_fps": steps / (learned - start),
+            "Perf/collection_time": collected - start,
+            "Perf/learning_time": learned - collected,
+            "Perf/env_steps": self.env_steps,
+            "Perf/wall_time": self.wall_time,
+        }
+        return self.logger.collect() | losses | own
 
     def _step(self) -> None:
         """One control step of every environment."""
@@ -169,7 +176,7 @@ class EagleRunner(OnPolicyRunner):
         self.alg.process_env_step(self._obs, rewards, dones, extras)
         self.logger.add_step(rewards, dones, extras)
 
-    def imitate(self, specialists: Sequence[EagleActor], method: Literal["distill", "kickstarting"]) -> None:
+    def imitate(self, specialists: Sequence[EagleActor], method: Literal["eagle", "kickstart"]) -> None:
         """Learn from one specialist per robot, in the order of the environment's robots, too."""
         self.alg.imitate(SpecialistBank([actor.to(self.device) for actor in specialists]), method)
 

@@ -15,7 +15,7 @@ from eagle_rl.config.schema import ExperimentCfg, TaskCfg
 from eagle_rl.errors import ConfigError
 
 Kind = Literal["root", "generalist", "continued", "specialist", "distill"]
-Imitation = Literal["none", "eagle", "kickstart"]
+Imitation = Literal["eagle", "kickstart"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +35,7 @@ class Stage:
     """Stage whose final weights this one starts from."""
     teachers: tuple[str, ...] = ()
     """Specialist stage of each robot, in the order of ``robots``."""
-    imitation: Imitation = "none"
+    imitation: Imitation | None = None
     seed: int
 
     @property

@@ -1,22 +1,21 @@
-"""What a run's folder says about its stages: written atomically, read by resume, by ``eagle status`` and by plots.
+"""What a run's folder says about its stages: written atomically, read by resume, ``eagle status`` and plots.
 
-``plan.json`` holds the planned stages, ``stages/NAME/stage.json`` the record of each. No torch.
+``plan.json`` holds the planned stages, ``stages/NAME/stage.json`` the record of each.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import json
-import os
-import uuid
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 from eagle_rl.errors import CheckpointError, ConfigError
+from eagle_rl.runners.checkpoint import verify_checkpoint, write_atomically
 from eagle_rl.runners.plan import Stage
+from eagle_rl.runners.provenance import Provenance
 
 State = Literal["pending", "training", "judging", "done"]
 
@@ -28,7 +27,6 @@ class Record:
     state: State = "pending"
     inputs: Mapping[str, str] = field(default_factory=dict)
     """sha256 of the final checkpoint of every input stage."""
-    iteration: int = 0
     env_steps: int = 0
     wall_seconds: float = 0.0
     checkpoint: str | None = None
@@ -43,25 +41,11 @@ def stage_dir(run_dir: Path, stage: str) -> Path:
     return run_dir / "stages" / stage
 
 
-def sha256_of(path: Path) -> str:
-    """Content hash of a file."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-def write_text_atomically(path: Path, text: str) -> None:
-    """Replace a file so that a reader, also after a crash, sees the old content or the new, never a part."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
-    with draft.open("w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    draft.replace(path)
-
-
 def write_record(run_dir: Path, stage: str, record: Record) -> None:
     """Store a stage's record."""
-    write_text_atomically(stage_dir(run_dir, stage) / "stage.json", json.dumps(dataclasses.asdict(record), indent=1))
+    write_atomically(
+        stage_dir(run_dir, stage) / "stage.json", json.dumps(dataclasses.asdict(record), indent=1).encode()
+    )
 
 
 def read_record(run_dir: Path, stage: str) -> Record:
@@ -78,53 +62,54 @@ def final_checkpoint(run_dir: Path, stage: str) -> Path:
     if record.state != "done" or record.checkpoint is None:
         raise CheckpointError(f"{run_dir}: stage {stage} is not done, so it has no final checkpoint.")
     path = run_dir / record.checkpoint
-    found = sha256_of(path) if path.exists() else "no file"
-    if found != record.sha256:
-        raise CheckpointError(
-            f"{path}: expected sha256 {record.sha256}, found {found}. Remove {stage} to train it again."
-        )
+    if verify_checkpoint(path)["sha256"] != record.sha256:
+        raise CheckpointError(f"{path}: is not the checkpoint the stage {stage} ended with (sha256 {record.sha256}).")
     return path
 
 
-def _plan_differences(planned: Any, asked: Any, path: str = "plan") -> Iterator[str]:
-    """What differs between two plans as read from JSON, one line each."""
-    if isinstance(planned, dict) and isinstance(asked, dict):
-        for key in sorted(planned.keys() | asked.keys()):
-            yield from _plan_differences(planned.get(key), asked.get(key), f"{path}.{key}")
-    elif planned != asked:
-        yield f"{path}: the run was begun with {planned!r}, now {asked!r}"
-
-
-def open_plan(run_dir: Path, config: Mapping[str, Any], stages: Sequence[Stage], resume: bool) -> None:
+def open_plan(
+    run_dir: Path, provenance: Provenance, stages: Sequence[Stage], *, resume: bool, allow_drift: bool = False
+) -> None:
     """Write the plan of a new run, or check that a resumed run is the one that was begun.
 
     Args:
         run_dir: the run's folder.
-        config: the resolved experiment, as plain data.
+        provenance: what the run depends on, its configuration included.
         stages: the planned stages.
         resume: whether the folder is expected to hold this run already.
+        allow_drift: go on although something has changed.
     """
     path = run_dir / "plan.json"
-    text = json.dumps({"config": config, "stages": {s.name: dataclasses.asdict(s) for s in stages}}, indent=1)
+    if path.exists():
+        if not resume:
+            raise ConfigError(f"{run_dir}: holds a run already. Continue it with --resume, or choose another --out.")
+        begun = json.loads(path.read_text(encoding="utf-8"))["provenance"]
+        changes = provenance.differences(begun)
+        if changes and not allow_drift:
+            raise ConfigError([f"{run_dir}: changed since the run was begun; undo it or use --allow-drift.", *changes])
+        if not changes:
+            return
+    run_dir.mkdir(parents=True, exist_ok=True)
+    plan = {"provenance": provenance.as_manifest(), "stages": [dataclasses.asdict(stage) for stage in stages]}
+    write_atomically(path, json.dumps(plan, indent=1).encode())
+
+
+def _read_plan_file(run_dir: Path) -> dict[str, Any]:
+    path = run_dir / "plan.json"
     if not path.exists():
-        write_text_atomically(path, text)
-        return
-    if not resume:
-        raise ConfigError(
-            f"{run_dir}: holds a run already. Continue it with --resume {run_dir}, or choose another --out."
-        )
-    differences = list(_plan_differences(json.loads(path.read_text(encoding="utf-8")), json.loads(text)))
-    if differences:
-        raise ConfigError([*differences, f"{run_dir}: resume with the settings it was begun with, or start a new run."])
+        raise ConfigError(f"{run_dir}: no plan.json, so this is no run of an experiment.")
+    return json.loads(path.read_text(encoding="utf-8"))
 
 
 def read_plan(run_dir: Path) -> list[Stage]:
     """The planned stages of a run."""
-    path = run_dir / "plan.json"
-    if not path.exists():
-        raise ConfigError(f"{run_dir}: no plan.json, so this is no run of an experiment.")
-    stages = json.loads(path.read_text(encoding="utf-8"))["stages"].values()
+    stages = _read_plan_file(run_dir)["stages"]
     return [Stage(**{**s, "robots": tuple(s["robots"]), "teachers": tuple(s["teachers"])}) for s in stages]
+
+
+def read_tolerance(run_dir: Path) -> float:
+    """The gain under which a run's rounds stop."""
+    return float(_read_plan_file(run_dir)["provenance"]["config"]["plan"]["tolerance"])
 
 
 def converged_round(stages: Sequence[Stage], records: Mapping[str, Record], tolerance: float) -> int | None:

@@ -18,11 +18,10 @@ from eagle_rl.errors import ConfigError
 
 from ..robots.slots import MIRROR_PERMUTATION, MIRROR_SIGN, NUM_SLOTS
 from ..robots.spec import COLLISION_LINKS
+from ..robots.structure import structure_mirror
 
 REFERENCE_MASS = 33.0
 """Robot mass at which ``ObservationScalesCfg.foot_force`` applies as it is [kg]."""
-EMBODIMENT_DIM = 30
-"""Size of the paper's o_ea: torso, left foot, right foot, each mass, CoM (3), inertia (xx, yy, zz, xy, xz, yz)."""
 
 
 @dataclass(frozen=True)
@@ -70,8 +69,10 @@ def _mirrored_link(link: str) -> str:
 LINKS = Mirror(tuple(COLLISION_LINKS.index(_mirrored_link(n)) for n in COLLISION_LINKS), (1.0,) * len(COLLISION_LINKS))
 
 _BODY_SIGN = (1.0, *POLAR.sign, 1.0, 1.0, 1.0, -1.0, 1.0, -1.0)
-EMBODIMENT = Mirror.stack([Mirror.keep(*_BODY_SIGN), Mirror.swap(10, _BODY_SIGN)])
-"""o_ea: CoM y and the products of inertia xy and yz flip, the feet change places."""
+_BODIES = Mirror.stack([Mirror.keep(*_BODY_SIGN), Mirror.swap(len(_BODY_SIGN), _BODY_SIGN)])
+EMBODIMENT = {"paper": _BODIES, "extended": Mirror.stack([_BODIES, Mirror(*structure_mirror())])}
+"""o_ea by descriptor: torso, left and right foot, each mass, CoM, inertia (xx, yy, zz, xy, xz, yz). CoM y and the
+products of inertia xy and yz flip, the feet change places."""
 
 
 @dataclass(frozen=True)
@@ -127,11 +128,13 @@ def _frame_terms(cfg: ObservationsCfg) -> tuple[ObservationTerm, ...]:
     return (*terms, ObservationTerm("last_action", "-", scales.last_action, SLOTS)) if cfg.last_action else terms
 
 
-def _embodiment_terms(mirror: Mirror | None) -> tuple[ObservationTerm, ...]:
-    return () if mirror is None else (ObservationTerm("embodiment", "standardised", 1.0, mirror),)
+def _embodiment_terms(cfg: ObservationsCfg) -> tuple[ObservationTerm, ...]:
+    if not cfg.embodiment_observation:
+        return ()
+    return (ObservationTerm("embodiment", "standardised", 1.0, EMBODIMENT[cfg.descriptor]),)
 
 
-def _tables(cfg: ObservationsCfg, embodiment: Mirror | None) -> dict[str, tuple[ObservationTerm, ...]]:
+def _tables(cfg: ObservationsCfg) -> dict[str, tuple[ObservationTerm, ...]]:
     scales = cfg.scales
     frame = _frame_terms(cfg)
     command = ObservationTerm("command", "m/s m/s rad/s m rad", scales.command, COMMAND)
@@ -149,8 +152,8 @@ def _tables(cfg: ObservationsCfg, embodiment: Mirror | None) -> dict[str, tuple[
         "history": frame * cfg.history_length,
         "command": (command,),
         "clock": (clock,),
-        "critic": (*frame, command, clock, base_lin_vel, *privileged, *_embodiment_terms(embodiment)),
-        "estimate": (base_lin_vel, *_embodiment_terms(embodiment)),
+        "critic": (*frame, command, clock, base_lin_vel, *privileged, *_embodiment_terms(cfg)),
+        "estimate": (base_lin_vel, *_embodiment_terms(cfg)),
         "actions": (ObservationTerm("actions", "-", 1.0, SLOTS),),
     }
 
@@ -158,18 +161,9 @@ def _tables(cfg: ObservationsCfg, embodiment: Mirror | None) -> dict[str, tuple[
 class ObservationLayout:
     """Columns of every observation group: "history", "command", "clock", "critic", "estimate", and of "actions"."""
 
-    def __init__(self, cfg: ObservationsCfg, embodiment_dim: int, embodiment_mirror: Mirror | None = None) -> None:
-        """Build the table.
-
-        Args:
-            cfg: what is observed, and scales.
-            embodiment_dim: size of o_ea, 0 where it is off.
-            embodiment_mirror: mirror of o_ea where it is not the paper's thirty numbers.
-        """
-        mirror = None if embodiment_dim == 0 else embodiment_mirror or EMBODIMENT
-        if mirror is not None and len(mirror.perm) != embodiment_dim:
-            raise ValueError(f"a mirror of {len(mirror.perm)} columns was given for o_ea of size {embodiment_dim}")
-        self.groups = _tables(cfg, mirror)
+    def __init__(self, cfg: ObservationsCfg) -> None:
+        """Build the table of what ``cfg`` observes."""
+        self.groups = _tables(cfg)
         self.frame_size = sum(term.size for term in _frame_terms(cfg))
 
     def size(self, group: str) -> int:
@@ -206,8 +200,8 @@ class ObservationLayout:
 
 @lru_cache(maxsize=64)
 def scale_vector(cfg: ObservationsCfg, group: str, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Factor of each column of a group but those of o_ea, which comes standardised, shape (columns,); built once."""
-    return torch.tensor(ObservationLayout(cfg, 0).scale(group), dtype=dtype, device=device)
+    """Factor of each column of a group as a tensor, shape (columns,), built once."""
+    return torch.tensor(ObservationLayout(cfg).scale(group), dtype=dtype, device=device)
 
 
 SENSED_SIZE = 3 + 3 + 2 * NUM_SLOTS

@@ -13,10 +13,9 @@ from eagle_rl.config.schema import ObservationsCfg, Range
 from ..geometry import rotate_yaw, yaw_of
 from ..state import PooledRobots, PooledState
 from .gait import clock
-from .layout import EMBODIMENT_DIM, REFERENCE_MASS, SENSED_SIZE, ObservationLayout, scale_vector, scan_points
+from .layout import REFERENCE_MASS, SENSED_SIZE, ObservationLayout, scale_vector, scan_points
 
 __all__ = [
-    "EMBODIMENT_DIM",
     "History",
     "ObservationLayout",
     "command_observation",
@@ -35,9 +34,8 @@ COLLISION_FORCE = 2.0
 def _scaled(columns: list[Tensor], cfg: ObservationsCfg, group: str) -> Tensor:
     """Lay columns side by side, scale and bound them."""
     x = torch.cat(columns, dim=1)
-    scale = scale_vector(cfg, group, x.dtype, x.device)[: x.shape[1]]
-    x[:, : len(scale)] *= scale
-    return x.clamp_(-cfg.clip, cfg.clip)
+    scale = scale_vector(cfg, group, x.dtype, x.device)
+    return x.mul_(scale[: x.shape[1]]).clamp_(-cfg.clip, cfg.clip)
 
 
 def _frame_columns(state: PooledState, robots: PooledRobots, cfg: ObservationsCfg) -> list[Tensor]:

@@ -16,7 +16,7 @@ from eagle_rl.paths import data_root
 from .slots import MIRROR_PERMUTATION, MIRROR_SIGN, SLOT_INDEX, SLOT_NAMES
 from .spec import COLLISION_LINKS, FALL_LINKS, FEET, Array, RobotSpec
 from .tree import Tree
-from .urdf import MAX_FILE_BYTES, MAX_VALUE, read_urdf
+from .urdf import MAX_FILE_BYTES, MAX_VALUE, as_sentence, read_urdf
 
 ROLES = tuple(dict.fromkeys((*FALL_LINKS, "left_foot", "right_foot", "left_hand", "right_hand", *COLLISION_LINKS)))
 """Every role a robot's links must fill."""
@@ -118,11 +118,11 @@ class _Draft:
 
     def spec(self) -> RobotSpec:
         self._check_keys()
-        urdf_path = (self.path.parent / str(self.data.get("urdf", ""))).resolve()
-        tree = self._tree(urdf_path)
-        if tree is None:
-            self._raise_faults()
-            raise AssertionError("unreachable: a missing tree is a fault")
+        urdf_path = self._path("urdf")
+        try:
+            tree = read_urdf(urdf_path)
+        except RobotError as error:
+            raise RobotError("\n".join([*self._messages(), str(error)])) from error
         spec = RobotSpec(
             name=str(self.data.get("name")),
             title=str(self.data.get("title")),
@@ -138,9 +138,12 @@ class _Draft:
         self._raise_faults()
         return spec
 
+    def _messages(self) -> list[str]:
+        return [as_sentence(f"{self.path}: {fault}") for fault in self.faults]
+
     def _raise_faults(self) -> None:
         if self.faults:
-            raise RobotError("\n".join(f"{self.path}: {fault}" for fault in self.faults))
+            raise RobotError("\n".join(self._messages()))
 
     def _check_keys(self) -> None:
         known = (*REQUIRED, *OPTIONAL)
@@ -149,12 +152,13 @@ class _Draft:
                 self.faults.append(f"unknown key {key!r}.{did_you_mean(str(key), known)}")
         self.faults += [f"key {key!r} is missing" for key in REQUIRED if key not in self.data]
 
-    def _tree(self, urdf_path: Path) -> Tree | None:
-        try:
-            return read_urdf(urdf_path)
-        except RobotError as error:
-            self.faults += str(error).splitlines()
-            return None
+    def _path(self, key: str) -> Path:
+        """A path given relative to the YAML."""
+        value = self.data.get(key)
+        if not isinstance(value, str) or "\0" in value:
+            self.faults.append(f"{key} is {value!r:.80}, expected a path relative to this file")
+            return self.path
+        return (self.path.parent / value).resolve()
 
     def _sources(self) -> dict[str, str]:
         sources = self.data.get("sources", {})
@@ -224,7 +228,7 @@ class _Draft:
     def _mesh_dir(self) -> Path | None:
         if self.data.get("mesh_dir") is None:
             return None
-        folder = (self.path.parent / str(self.data["mesh_dir"])).resolve()
+        folder = self._path("mesh_dir")
         if not folder.is_dir():
             self.faults.append(f"mesh_dir {folder} is not a folder; leave the key out to render primitives")
         return folder

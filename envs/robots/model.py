@@ -47,11 +47,13 @@ def build_model(spec: RobotSpec, sim: SimCfg, heightfield: HeightField | None = 
     Raises:
         RobotError: if MuJoCo refuses the robot.
     """
-    world = build_spec(spec, sim)
-    add_floor(world, heightfield)
-    add_sensors(world, spec)
     try:
+        world = build_spec(spec, sim)
+        add_floor(world, heightfield)
+        add_sensors(world, spec)
         return world.compile()
+    except RobotError:
+        raise
     except ValueError as error:
         raise RobotError(f"{spec.yaml_path}: MuJoCo refuses the robot: {error}") from error
 

@@ -90,7 +90,7 @@ class _Reader:
 
     def _raise_faults(self) -> None:
         if self.faults:
-            raise RobotError("\n".join(f"URDF {self.path}: {fault}." for fault in self.faults))
+            raise RobotError("\n".join(as_sentence(f"URDF {self.path}: {fault}") for fault in self.faults))
 
     def _by_name(self, items: list[Named], what: str) -> dict[str, Named]:
         out: dict[str, Named] = {}
@@ -248,6 +248,11 @@ class _Reader:
         for body in tree.bodies:
             if body.inertial.mass <= 0.0:
                 self.faults.append(f"link {body.name} moves but has no mass")
+
+
+def as_sentence(fault: str) -> str:
+    """End a fault with a full stop unless it ends already."""
+    return fault if fault.endswith((".", "?")) else f"{fault}."
 
 
 def _is_inertia(inertia: Array) -> bool:

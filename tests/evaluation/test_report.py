@@ -13,7 +13,8 @@ from eagle_rl.errors import ConfigError
 from eagle_rl.evaluation.evaluate import EvaluationResult, evaluate
 from eagle_rl.evaluation.metrics import SUBSETS, RobotMetrics, TrackingErrors
 from eagle_rl.evaluation.reference import PAPER, STAND_STILL
-from eagle_rl.evaluation.report import FORMATS, pooled_score, to_csv, to_json, to_latex, to_markdown, tracking_table
+from eagle_rl.evaluation.render import FORMATS, to_csv, to_json, to_latex, to_markdown
+from eagle_rl.evaluation.report import pooled_score, tracking_table
 from tests.evaluation.fake import idle, make_scripted_env, perfect
 
 EV = EvaluationCfg(num_envs_per_robot=16, num_steps=2)
@@ -68,6 +69,14 @@ def test_all_formats_carry_the_same_numbers():
     assert "0.123 [0.108]" in to_latex(table)
     assert float(list(csv.DictReader(io.StringIO(to_csv(table))))[-1]["E_vx"]) == 0.1234
     assert json.loads(to_json(table))["rows"][-1]["cells"][0]["mean"] == 0.1234
+
+
+def test_the_lowest_error_of_each_robot_is_bold_and_floors_never_are():
+    table = tracking_table({"A": [result((0.1, 0.2, 0.3, 0.4, 0.5))], "B": [result((0.2, 0.1, 0.9, 0.9, 0.9))]})
+    lines = {line.split(" | ")[1]: line for line in to_markdown(table).splitlines() if line.startswith("| h1")}
+    assert lines["A"].count("**") == 2 * 4
+    assert "**0.200**" in lines["B"]
+    assert "**" not in lines["best constant"]
 
 
 def test_a_subset_without_steps_shows_a_dash():

@@ -12,7 +12,7 @@ from torch import Tensor
 from eagle_rl.config.schema import ObservationsCfg
 from eagle_rl.errors import ConfigError
 from envs.mdp.gait import clock
-from envs.mdp.layout import EMBODIMENT_DIM, ObservationLayout, scan_points
+from envs.mdp.layout import EMBODIMENT, ObservationLayout, scan_points
 from envs.mdp.observations import (
     History,
     command_observation,
@@ -23,12 +23,14 @@ from envs.mdp.observations import (
     proprioception,
 )
 from envs.mdp.symmetry import mirror_state
+from envs.robots.embodiment import Descriptor, embodiment_dim
 from envs.state import PooledRobots, PooledState
 from tests.states import quaternion, quiet_state, random_robots, random_state
 
 CFG = ObservationsCfg()
 FRICTION = (0.5, 1.5)
-LAYOUT = ObservationLayout(CFG, EMBODIMENT_DIM)
+LAYOUT = ObservationLayout(CFG)
+EMBODIMENT_DIM = 30
 ROBOTS = random_robots(0)
 N = len(ROBOTS.robot_id)
 
@@ -61,8 +63,8 @@ def test_layout_has_the_size_of_every_group() -> None:
 
 
 def test_without_embodiment_and_last_action_the_groups_shrink() -> None:
-    cfg = replace(CFG, last_action=False)
-    layout, state = ObservationLayout(cfg, 0), random_state(0, ROBOTS)
+    cfg = replace(CFG, last_action=False, embodiment_observation=False)
+    layout, state = ObservationLayout(cfg), random_state(0, ROBOTS)
     assert proprioception(state, ROBOTS, cfg).shape[1] == layout.frame_size == 70
     assert noise_scale(cfg, ROBOTS).shape[1] == 70
     assert estimation_target(state, None, cfg).shape[1] == layout.size("estimate") == 3
@@ -174,12 +176,15 @@ def test_scan_points_run_over_x_outside_and_y_inside_and_mirror_in_y() -> None:
 
 def test_a_lopsided_scan_is_refused() -> None:
     with pytest.raises(ConfigError, match="scan_y"):
-        ObservationLayout(replace(CFG, scan_y=(-0.42, 0.35, 12)), 0)
+        ObservationLayout(replace(CFG, scan_y=(-0.42, 0.35, 12)))
 
 
-def test_a_descriptor_of_another_size_needs_its_own_mirror() -> None:
-    with pytest.raises(ValueError, match="o_ea of size 40"):
-        ObservationLayout(CFG, 40)
+@pytest.mark.parametrize("descriptor", ["paper", "extended"])
+def test_layout_has_the_size_and_mirror_of_either_descriptor(descriptor: Descriptor) -> None:
+    layout = ObservationLayout(replace(CFG, descriptor=descriptor))
+    assert layout.size("estimate") == 3 + embodiment_dim(descriptor)
+    perm = torch.tensor(EMBODIMENT[descriptor].perm)
+    assert torch.equal(perm[perm], torch.arange(embodiment_dim(descriptor)))
 
 
 def test_height_error_is_measured_against_the_command_and_clipped() -> None:

@@ -10,12 +10,12 @@ import pytest
 from eagle_rl.config.schema import SimCfg
 from envs.robots.check import mass_matrix
 from envs.robots.embodiment import pinocchio_model
-from envs.robots.load import load_robot, robot_names
+from envs.robots.load import robot_names
 from envs.robots.model import build_model
 from envs.robots.spec import Array, RobotSpec
 from envs.robots.urdf import read_urdf
 
-from .vendor import ROBOTS, vendor_joint_pos, vendor_numbers
+from .vendor import ROBOTS, shipped, vendor_joint_pos, vendor_numbers
 
 POINTS = np.array([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0], [0.0, 0.5, 0.0]])
 
@@ -26,7 +26,7 @@ def test_the_five_robots_are_shipped() -> None:
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_total_mass_is_the_vendors(name: str) -> None:
-    spec = load_robot(name)
+    spec = shipped(name)
     expected = vendor_numbers(name)["total_mass"]
     assert spec.total_mass == pytest.approx(expected, abs=1e-6)
     assert build_model(spec, SimCfg()).body_mass.sum() == pytest.approx(expected, abs=1e-6)
@@ -34,7 +34,7 @@ def test_total_mass_is_the_vendors(name: str) -> None:
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_joint_order_and_limits_are_the_vendors(name: str) -> None:
-    spec, joints = load_robot(name), vendor_numbers(name)["joints"]
+    spec, joints = shipped(name), vendor_numbers(name)["joints"]
     assert spec.joint_names == tuple(joints)
     ours = np.stack([spec.joint_lower, spec.joint_upper, spec.effort_limit, spec.velocity_limit], axis=1)
     np.testing.assert_allclose(ours, list(joints.values()), atol=1e-12)
@@ -42,7 +42,7 @@ def test_joint_order_and_limits_are_the_vendors(name: str) -> None:
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_every_merged_body_has_the_vendors_inertia(name: str) -> None:
-    spec = load_robot(name)
+    spec = shipped(name)
     expected = vendor_numbers(name)["bodies"]
     tree, model = read_urdf(spec.urdf_path), build_model(spec, SimCfg())
     assert [body.name for body in tree.bodies] == [model.body(i).name for i in range(1, model.nbody)]
@@ -59,7 +59,7 @@ def test_every_merged_body_has_the_vendors_inertia(name: str) -> None:
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_torso_feet_and_hands_are_where_the_vendor_has_them_in_100_poses(name: str) -> None:
-    spec, numbers = load_robot(name), vendor_numbers(name)
+    spec, numbers = shipped(name), vendor_numbers(name)
     tree, model = read_urdf(spec.urdf_path), build_model(spec, SimCfg())
     data = mujoco.MjData(model)
     assert len(numbers["poses"]) == 100
@@ -80,7 +80,7 @@ def test_torso_feet_and_hands_are_where_the_vendor_has_them_in_100_poses(name: s
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_mass_matrices_of_pinocchio_and_mujoco_agree(name: str) -> None:
-    spec = load_robot(name)
+    spec = shipped(name)
     model = build_model(spec, SimCfg())
     model.dof_armature[:] = 0.0
     data = mujoco.MjData(model)

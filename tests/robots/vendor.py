@@ -8,17 +8,25 @@ points half a metre along its x and y axes, in the base frame.
 from __future__ import annotations
 
 import json
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from envs.robots.spec import Array
+from envs.robots.load import load_robot
+from envs.robots.spec import Array, RobotSpec
 
 ROBOTS = ("h1", "g1", "t1", "n1", "adam")
 DATA = Path(__file__).parents[1] / "data" / "robots"
 
 _PRIMES = [n for n in range(2, 110) if all(n % k for k in range(2, n))]
+
+
+@cache
+def shipped(name: str) -> RobotSpec:
+    """A shipped robot, loaded once."""
+    return load_robot(name)
 
 
 def vendor_numbers(name: str) -> dict[str, Any]:

@@ -1,0 +1,167 @@
+"""``eagle evaluate``: tracking errors and survival of checkpoints, as the paper's table."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from eagle_rl.config.schema import EvaluationCfg, ExperimentCfg
+from eagle_rl.errors import ConfigError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from eagle_rl.evaluation.evaluate import EvaluationResult
+    from eagle_rl.evaluation.report import Table
+
+METHODS = {
+    "ppo": "PPO",
+    "ppo_no_eo": "PPO w/o EO",
+    "compass": "COMPASS",
+    "kickstarting": "Kickstarting",
+    "eagle": "EAGLE",
+    "eagle_id": "EAGLE w/ ID",
+}
+"""The paper's name for each of its experiments."""
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="eagle evaluate",
+        description="Tracking errors and survival of checkpoints. A repeated name is another seed of the same method.",
+        epilog="Example: eagle evaluate PPO=logs/ppo/RUN EAGLE=logs/eagle/RUN1 EAGLE=logs/eagle/RUN2 --out results",
+    )
+    parser.add_argument("checkpoints", nargs="+", metavar="[NAME=]CKPT", help="checkpoint, stage, run, or result .json")
+    parser.add_argument("--robots", metavar="A,B", help="robots to judge on [those it was trained on]")
+    parser.add_argument("--envs", type=int, metavar="N", help="environments per robot [the experiment's]")
+    parser.add_argument("--steps", type=int, metavar="N", help="control steps [the experiment's, 1000 in the paper]")
+    parser.add_argument("--protocol", choices=("single", "joint"), help="draw one command at a time, or all five")
+    parser.add_argument("--resample", type=float, metavar="S", help="redraw commands every S seconds, 0 never")
+    parser.add_argument("--seed", type=int, metavar="N", help="seed of commands and randomization")
+    parser.add_argument("--randomize", action="store_true", help="randomized dynamics, with pushes")
+    parser.add_argument("--noise", action="store_true", help="sensor noise")
+    parser.add_argument(
+        "--subset", default="all", metavar="NAME", help="all, settled, standing, walking, squatting, leaning"
+    )
+    parser.add_argument(
+        "--falls", choices=("charged", "errors"), default="charged", help="charge |c_d| after a fall, or stop"
+    )
+    parser.add_argument("--out", type=Path, metavar="DIR", help="write results and table.{md,csv,tex,json} here")
+    return parser
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """One checkpoint to judge."""
+
+    method: str
+    checkpoint: Path
+    cfg: ExperimentCfg
+
+
+def _split(word: str) -> tuple[str | None, Path]:
+    """``NAME=PATH`` or ``PATH``."""
+    name, equals, path = word.partition("=")
+    return (name, Path(path)) if equals else (None, Path(word))
+
+
+def _candidate(name: str | None, path: Path) -> _Candidate:
+    from eagle_rl.config.load import experiment_from_plain
+    from eagle_rl.runners.checkpoint import read_manifest
+    from eagle_rl.runners.locate import find_checkpoint
+
+    checkpoint = find_checkpoint(path)
+    cfg = experiment_from_plain(read_manifest(checkpoint)["config"], str(checkpoint))
+    return _Candidate(name or METHODS.get(cfg.name, cfg.name), checkpoint, cfg)
+
+
+def _protocol(ev: EvaluationCfg, args: argparse.Namespace) -> EvaluationCfg:
+    """The experiment's protocol with the command line's changes."""
+    asked = {
+        "num_envs_per_robot": args.envs,
+        "num_steps": args.steps,
+        "protocol": args.protocol,
+        "resampling_time_s": args.resample,
+        "seed": args.seed,
+        "randomization": args.randomize or None,
+        "noise": args.noise or None,
+    }
+    return dataclasses.replace(ev, **{key: value for key, value in asked.items() if value is not None})
+
+
+def _judge(candidate: _Candidate, ev: EvaluationCfg, robots: str | None, console: Console) -> EvaluationResult:
+    """Evaluate one checkpoint, with progress."""
+    import torch
+    from rich.progress import Progress
+
+    from eagle_rl.evaluation.evaluate import EvaluationResult, evaluate
+    from eagle_rl.runners.checkpoint import load_actor
+
+    from .environment import make_env_factory
+
+    cfg = candidate.cfg
+    names = tuple(robots.split(",")) if robots and robots != "all" else cfg.robots
+    torch.set_num_threads(cfg.run.torch_threads)
+    actor, manifest = load_actor(candidate.checkpoint, cfg.run.device)
+    make_env = make_env_factory(cfg.run)
+    with Progress(console=console, transient=True) as progress:
+        bar = progress.add_task(candidate.method, total=len(names) * ev.num_envs_per_robot * ev.num_steps)
+        scores = evaluate(actor, make_env, names, cfg.task, ev, on_step=lambda n: progress.advance(bar, n))
+    return EvaluationResult(checkpoint=manifest["sha256"], protocol=ev, robots=scores, seed=cfg.seed)
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run ``eagle evaluate``."""
+    args = _parser().parse_args(argv)
+
+    from rich.console import Console
+
+    from eagle_rl.evaluation.evaluate import EvaluationResult
+    from eagle_rl.evaluation.metrics import SUBSETS
+    from eagle_rl.evaluation.render import to_markdown
+    from eagle_rl.evaluation.report import tracking_table
+
+    if args.subset not in SUBSETS:
+        raise ConfigError(f"--subset: got {args.subset!r}, expected one of {', '.join(SUBSETS)}.")
+    console = Console(stderr=True)
+    results: dict[str, list[EvaluationResult]] = {}
+    for name, path in map(_split, args.checkpoints):
+        if _is_result(path):
+            method, result = name or path.stem, EvaluationResult.read(path)
+        else:
+            candidate = _candidate(name, path)
+            method, ev = candidate.method, _protocol(candidate.cfg.evaluation, args)
+            result = _judge(candidate, ev, args.robots, console)
+        results.setdefault(method, []).append(result)
+    table = tracking_table(results, args.subset, args.falls)
+    print(to_markdown(table))
+    if args.out is not None:
+        _write(args.out, results, table)
+    return 0
+
+
+def _is_result(path: Path) -> bool:
+    """Whether a path is a stored result, not the manifest of a checkpoint."""
+    return path.suffix == ".json" and not path.name.startswith("model_")
+
+
+def _write(folder: Path, results: Mapping[str, Sequence[EvaluationResult]], table: Table) -> None:
+    """Store results and table."""
+    from eagle_rl.evaluation.render import FORMATS
+
+    folder.mkdir(parents=True, exist_ok=True)
+    for method, runs in results.items():
+        for run in runs:
+            file = folder / f"{_slug(method)}_seed{run.seed}_{run.checkpoint[:8]}.json"
+            file.write_text(run.to_json(), encoding="utf-8")
+    for suffix, write in FORMATS.items():
+        (folder / f"table.{suffix}").write_text(write(table), encoding="utf-8")
+
+
+def _slug(name: str) -> str:
+    """A name fit for a file."""
+    return "".join(c if c.isalnum() else "_" for c in name).strip("_").lower()

@@ -1,0 +1,90 @@
+"""One stage of the plan, trained by the on-policy runner to its last iteration, wherever it stopped before."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rsl_rl.env import VecEnv
+
+from eagle_rl.config.schema import ExperimentCfg, TaskCfg
+from eagle_rl.errors import CheckpointError
+from eagle_rl.runners.checkpoint import latest_checkpoint, load_actor, read_manifest, verify_checkpoint
+from eagle_rl.runners.on_policy import EagleRunner, make_train_cfg
+from eagle_rl.runners.plan import Stage, warm_task
+from eagle_rl.runners.provenance import Provenance
+
+MakeEnv = Callable[[Sequence[str], int, TaskCfg, int], Any]
+"""Builds an environment from robot names, number of environments, task and seed; picklable for several jobs."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """A stage with everything resolved that its training needs."""
+
+    cfg: ExperimentCfg
+    """The experiment with this stage's robots and task."""
+    stage: Stage
+    folder: Path
+    """Where checkpoints and logs go."""
+    init: Path | None
+    """Checkpoint whose weights to start from."""
+    teachers: tuple[Path, ...]
+    """Final checkpoint of each robot's specialist."""
+    make_env: MakeEnv
+    provenance: Provenance
+    check_claim: Callable[[], None]
+    """Raises once another process has taken the stage over."""
+    allow_drift: bool = False
+
+
+def stage_cfg(cfg: ExperimentCfg, stage: Stage) -> ExperimentCfg:
+    """The experiment as one stage sees it: its robots and its task."""
+    task = warm_task(cfg.task) if stage.warm else cfg.task
+    return dataclasses.replace(cfg, robots=stage.robots, task=task)
+
+
+def train(job: Job) -> Path:
+    """Train to the stage's last iteration, continuing what the folder holds; the final checkpoint."""
+    checkpoints = job.folder / "checkpoints"
+    latest = latest_checkpoint(checkpoints)
+    if latest is not None and read_manifest(latest)["stage_end"]:
+        return latest
+    if job.stage.kind == "root":
+        return _copy_root(job, checkpoints)
+    runner = _make_runner(job)
+    if latest is not None:
+        runner.load(latest, allow_drift=job.allow_drift)
+    elif job.init is not None:
+        runner.load_weights(job.init)
+    left = job.stage.iterations - runner.current_learning_iteration
+    runner.learn(left, on_iteration=lambda iteration: job.check_claim())
+    return checkpoints / f"model_{job.stage.iterations}.pt"
+
+
+def _make_runner(job: Job) -> EagleRunner:
+    """The runner of a stage, its specialists loaded."""
+    cfg, stage = job.cfg, job.stage
+    env: VecEnv = job.make_env(stage.robots, cfg.num_envs, cfg.task, stage.seed)
+    history = cfg.task.observations.history_length
+    train_cfg = make_train_cfg(cfg.algo, cfg.run, history_length=history, seed=stage.seed)
+    runner = EagleRunner(env, train_cfg, job.folder, cfg.run.device, job.provenance)
+    if stage.imitation is not None:
+        runner.imitate([load_actor(path)[0] for path in job.teachers], stage.imitation)
+    return runner
+
+
+def _copy_root(job: Job, checkpoints: Path) -> Path:
+    """Take the experiment's root checkpoint into the run, so that the run is complete without it."""
+    source = Path(job.cfg.plan.root or "").with_suffix(".pt")
+    if not source.exists():
+        raise CheckpointError(f"plan.root: {source}: no such checkpoint.")
+    verify_checkpoint(source)
+    checkpoints.mkdir(parents=True, exist_ok=True)
+    for suffix in (".pt", ".json"):  # the manifest last: what has one is complete
+        shutil.copyfile(source.with_suffix(suffix), checkpoints / source.with_suffix(suffix).name)
+    return checkpoints / source.name

@@ -1,0 +1,50 @@
+"""``eagle evaluate`` on a run of the real simulation, and on stored results."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from eagle_rl.cli.environment import make_env_factory
+from eagle_rl.cli.evaluate import main
+from eagle_rl.config.load import load_experiment
+from eagle_rl.errors import ConfigError
+from eagle_rl.evaluation.evaluate import EvaluationResult
+from eagle_rl.runners.stages import run_experiment
+
+QUICK = ["--envs", "2", "--steps", "10"]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """The smoke experiment's generalist on one robot."""
+    cfg = load_experiment("smoke", ["robots=[h1]", "plan.method=ppo", "plan.judge_envs_per_robot=0", "seed=7"])
+    return run_experiment(cfg, tmp_path_factory.mktemp("run"), make_env_factory(cfg.run))
+
+
+def test_a_run_becomes_a_table_with_hash_protocol_and_seed(run, tmp_path, capsys):
+    assert main([f"PPO={run.run_dir}", *QUICK, "--out", str(tmp_path)]) == 0
+    assert {f"table.{suffix}" for suffix in ("md", "csv", "tex", "json")} <= {path.name for path in tmp_path.iterdir()}
+    result = EvaluationResult.read(next(tmp_path.glob("ppo_seed7_*.json")))
+    assert result.checkpoint == run.records["generalist"].sha256
+    assert (result.protocol.num_envs_per_robot, result.protocol.num_steps, result.seed) == (2, 10, 7)
+    assert "| h1 | PPO |" in capsys.readouterr().out
+
+
+def test_stored_results_are_tabled_without_simulating_again(run, tmp_path, capsys):
+    main([f"PPO={run.run_dir}", *QUICK, "--out", str(tmp_path)])
+    stored = next(tmp_path.glob("ppo_*.json"))
+    first = capsys.readouterr().out
+    assert main([f"PPO={stored}"]) == 0
+    assert capsys.readouterr().out == first
+
+
+def test_a_checkpoint_is_named_after_its_experiment_unless_told_otherwise(run, tmp_path):
+    main([str(run.generalist), *QUICK, "--out", str(tmp_path)])
+    assert json.loads((tmp_path / "table.json").read_text())["checkpoints"].keys() == {"smoke"}
+
+
+def test_an_unknown_subset_is_refused(run):
+    with pytest.raises(ConfigError, match="walking"):
+        main([str(run.run_dir), "--subset", "walkin"])

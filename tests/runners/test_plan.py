@@ -1,0 +1,106 @@
+"""Plans as data."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from eagle_rl.config.schema import ExperimentCfg, PlanCfg
+from eagle_rl.errors import ConfigError
+from eagle_rl.runners.plan import plan_stages, warm_task
+from eagle_rl.runners.records import Record, active_stages, converged_round
+
+EAGLE = PlanCfg(method="eagle", generalist_env_steps=100, specialist_env_steps=10, distill_env_steps=20, max_rounds=3)
+
+
+def plan(**changes) -> list:
+    return plan_stages(ExperimentCfg(name="x", plan=dataclasses.replace(EAGLE, **changes)))
+
+
+def test_ppo_is_the_generalist_alone():
+    assert [stage.name for stage in plan(method="ppo")] == ["generalist"]
+
+
+def test_every_round_starts_from_the_generalist_before_it():
+    stages = {stage.name: stage for stage in plan()}
+    assert stages["round1/specialist_g1"].inputs == ("generalist",)
+    assert stages["round1/distill"].init == "generalist"
+    assert stages["round2/specialist_g1"].inputs == ("round1/distill",)
+    assert stages["round2/distill"].init == "round1/distill"
+
+
+def test_distillation_has_one_teacher_per_robot_in_order():
+    cfg = ExperimentCfg(name="x", plan=EAGLE)
+    distill = next(stage for stage in plan_stages(cfg) if stage.kind == "distill")
+    assert distill.robots == cfg.robots
+    assert distill.teachers == tuple(f"round1/specialist_{robot}" for robot in cfg.robots)
+
+
+def test_inputs_come_before_the_stages_that_need_them():
+    seen: set[str] = set()
+    for stage in plan():
+        assert seen.issuperset(stage.inputs)
+        seen.add(stage.name)
+
+
+@given(steps=st.integers(1, 10**9), envs=st.integers(1, 5000))
+def test_budgets_are_spent_in_whole_iterations_and_never_undershot(steps, envs):
+    stage = plan_stages(ExperimentCfg(name="x", num_envs=envs, plan=PlanCfg(generalist_env_steps=steps)))[0]
+    spent = stage.iterations * envs * 24
+    assert steps <= spent < steps + envs * 24
+
+
+def test_stages_have_seeds_of_their_own_that_follow_the_runs_seed():
+    seeds = [stage.seed for stage in plan()]
+    assert len(set(seeds)) == len(seeds)
+    other = plan_stages(ExperimentCfg(name="x", seed=2, plan=EAGLE))
+    assert not set(seeds) & {stage.seed for stage in other}
+
+
+def test_a_root_takes_the_place_of_the_generalist():
+    stages = plan(root="model.pt")
+    assert (stages[0].name, stages[0].env_steps, stages[0].iterations) == ("root", 0, 0)
+    assert stages[1].inputs == ("root",)
+    assert [stage.name for stage in plan(root="model.pt", method="ppo")] == ["root", "continued"]
+
+
+def test_robots_from_files_name_their_stage_by_the_stem():
+    stages = plan_stages(ExperimentCfg(name="x", robots=("my/bot.yaml",), plan=EAGLE))
+    assert stages[1].name == "round1/specialist_bot"
+
+
+def test_compass_is_refused_in_words():
+    with pytest.raises(ConfigError, match="compass"):
+        plan(method="compass")
+
+
+def test_a_warm_task_has_whole_penalties_finishing_ranges_and_no_aids():
+    task = warm_task(ExperimentCfg(name="x").task)
+    assert (task.aids.harness, task.aids.gait_shaping, task.rewards.penalty_initial) == (0.0, 0.0, 1.0)
+    assert not task.commands.curriculum.enabled
+    assert task.randomization.enabled, "randomization stays: specialists train in the whole task"
+
+
+@pytest.mark.parametrize(
+    ("scores", "converged"),
+    [
+        ((0.5, None, None, None), None),
+        ((0.5, 0.4, None, None), None),
+        ((0.5, 0.497, None, None), 1),
+        ((0.5, 0.6, None, None), 1),
+        ((0.5, 0.4, 0.399, None), 2),
+        ((0.5, 0.4, 0.3, 0.2), None),
+        ((None, 0.4, None, None), None),
+    ],
+)
+def test_a_round_that_gains_less_than_the_tolerance_is_the_last(scores, converged):
+    stages = plan()
+    generalists = [stage for stage in stages if stage.kind != "specialist"]
+    records = {stage.name: Record() for stage in stages}
+    records |= {stage.name: Record(score=score) for stage, score in zip(generalists, scores, strict=True)}
+    assert converged_round(stages, records, 0.01) == converged
+    rounds = {stage.round for stage in active_stages(stages, records, 0.01)}
+    assert rounds == set(range((3 if converged is None else converged) + 1))

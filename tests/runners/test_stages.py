@@ -1,0 +1,169 @@
+"""The stage machine on toy robots with the real learner."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from eagle_rl.errors import CheckpointError, ConfigError
+from eagle_rl.evaluation.evaluate import EvaluationResult
+from eagle_rl.runners.checkpoint import load_checkpoint
+from eagle_rl.runners.claims import Claim, ClaimLostError
+from eagle_rl.runners.records import read_record, stage_dir
+from eagle_rl.runners.stages import run_experiment
+from tests.runners.toy_run import ENVS, STEPS, make_toy_env, parameters, toy_experiment
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """One round of EAGLE, run without interruption."""
+    return run_experiment(toy_experiment(), tmp_path_factory.mktemp("runs") / "eagle", make_toy_env)
+
+
+def test_one_round_trains_generalist_specialists_and_distillation(finished):
+    assert list(finished.records) == [
+        "generalist",
+        "round1/specialist_one",
+        "round1/specialist_two",
+        "round1/specialist_three",
+        "round1/distill",
+    ]
+    assert all(record.state == "done" for record in finished.records.values())
+    assert finished.generalist.parent.parent == stage_dir(finished.run_dir, "round1/distill")
+
+
+def test_costs_are_counted_per_stage(finished):
+    assert {record.env_steps for record in finished.records.values()} == {3 * ENVS * STEPS}
+    assert all(record.wall_seconds > 0 for record in finished.records.values())
+    assert finished.env_steps == 5 * 3 * ENVS * STEPS
+
+
+def test_stages_name_their_inputs_by_content(finished):
+    records = finished.records
+    generalist = records["generalist"].sha256
+    assert records["round1/specialist_two"].inputs == {"generalist": generalist}
+    specialists = {name: r.sha256 for name, r in records.items() if "specialist" in name}
+    assert records["round1/distill"].inputs == {"generalist": generalist, **specialists}
+
+
+def test_every_stage_is_judged_on_its_own_robots(finished):
+    path = stage_dir(finished.run_dir, "round1/specialist_two") / "evaluation.json"
+    result = EvaluationResult.read(path)
+    assert list(result.robots) == ["two"]
+    assert result.checkpoint == finished.records["round1/specialist_two"].sha256
+
+
+def test_a_specialist_starts_from_the_generalists_weights(tmp_path):
+    cfg = toy_experiment(iterations=1, judge_envs=0)
+    seen = {}
+
+    def watch(robots, num_envs, task, seed):
+        seen[tuple(robots)] = task
+        return make_toy_env(robots, num_envs, task, seed)
+
+    run_experiment(cfg, tmp_path / "run", watch)
+    assert seen[("one", "two", "three")].aids.harness == 0.0, "distillation is the last pooled stage"
+    assert seen[("two",)].aids.harness == 0.0
+    assert not seen[("two",)].commands.curriculum.enabled
+
+
+def test_a_finished_run_resumes_to_itself(finished):
+    again = run_experiment(toy_experiment(), finished.run_dir, make_toy_env, resume=True)
+    assert again.records == finished.records
+
+
+def test_a_run_is_not_overwritten_without_resume(finished):
+    with pytest.raises(ConfigError, match="holds a run already"):
+        run_experiment(toy_experiment(), finished.run_dir, make_toy_env)
+
+
+def test_resume_with_another_configuration_lists_what_changed(finished):
+    with pytest.raises(ConfigError, match=r"plan\.distill_env_steps: 144 -> 7"):
+        run_experiment(toy_experiment(distill_env_steps=7), finished.run_dir, make_toy_env, resume=True)
+
+
+def test_two_workers_reach_the_same_parameters_as_one(finished, tmp_path):
+    both = run_experiment(toy_experiment(), tmp_path / "run", make_toy_env, jobs=2)
+    one, two = parameters(finished), parameters(both)
+    assert all(torch.equal(one[key], two[key]) for key in one)
+
+
+def test_a_worker_whose_stage_was_taken_over_leaves_it_unrecorded_and_goes_on(tmp_path, monkeypatch):
+    check, lost = Claim.check, []
+
+    def lose_once(claim):
+        if not lost:
+            lost.append(read_record(tmp_path, "generalist").state)
+            raise ClaimLostError
+        check(claim)
+
+    monkeypatch.setattr(Claim, "check", lose_once)
+    result = run_experiment(toy_experiment(iterations=1, judge_envs=0), tmp_path, make_toy_env)
+    assert lost == ["training"]
+    assert result.records["round1/distill"].state == "done"
+
+
+def test_rounds_stop_when_the_score_no_longer_improves(tmp_path):
+    result = run_experiment(toy_experiment(iterations=1, max_rounds=3, tolerance=10.0), tmp_path / "run", make_toy_env)
+    assert result.records["round1/distill"].state == "done"
+    assert result.records["round2/specialist_one"].state == "pending"
+    assert "round1" in str(result.generalist)
+
+
+def test_rounds_go_on_while_the_score_improves(tmp_path):
+    cfg = toy_experiment(iterations=1, max_rounds=2, tolerance=-10.0)
+    result = run_experiment(cfg, tmp_path / "run", make_toy_env)
+    assert "round2" in str(result.generalist)
+    assert result.records["round2/specialist_one"].inputs.keys() == {"round1/distill"}
+
+
+def test_ppo_continued_forks_from_a_root_with_fresh_counters(finished, tmp_path):
+    root = finished.run_dir / finished.records["generalist"].checkpoint
+    cfg = toy_experiment(iterations=2, method="ppo", root=str(root))
+    result = run_experiment(cfg, tmp_path / "run", make_toy_env)
+    assert list(result.records) == ["root", "continued"]
+    assert result.records["root"].sha256 == finished.records["generalist"].sha256
+    assert result.records["root"].env_steps == 0
+    assert result.env_steps == 2 * ENVS * STEPS
+
+
+def test_kickstarting_distils_with_its_own_loss(finished, tmp_path):
+    root = finished.run_dir / finished.records["generalist"].checkpoint
+    cfg = toy_experiment(iterations=1, judge_envs=0, method="kickstarting", root=str(root))
+    result = run_experiment(cfg, tmp_path / "run", make_toy_env)
+    metrics = (stage_dir(result.run_dir, "round1/distill") / "metrics.jsonl").read_text()
+    assert "Distill/kickstart_kl" in metrics
+    assert "Distill/L_a" not in metrics
+
+
+def test_distillation_learns_from_the_specialists_of_this_round(finished):
+    metrics = (stage_dir(finished.run_dir, "round1/distill") / "metrics.jsonl").read_text()
+    assert all(f"Distill/L_{loss}/{robot}" in metrics for loss in "ae" for robot in ("one", "two", "three"))
+
+
+def test_a_damaged_input_is_refused_by_name(tmp_path):
+    cfg = toy_experiment(iterations=1, judge_envs=0)
+    result = run_experiment(cfg, tmp_path / "run", make_toy_env)
+    damaged = result.run_dir / result.records["generalist"].checkpoint
+    damaged.write_bytes(damaged.read_bytes()[:-1] + b"x")
+    (stage_dir(result.run_dir, "round1/distill") / "stage.json").unlink()
+    with pytest.raises(CheckpointError, match="generalist"):
+        run_experiment(cfg, result.run_dir, make_toy_env, resume=True)
+
+
+def test_a_missing_root_is_named(tmp_path):
+    with pytest.raises(CheckpointError, match=r"plan\.root"):
+        run_experiment(toy_experiment(method="ppo", root="nowhere.pt"), tmp_path / "run", make_toy_env)
+
+
+def test_the_run_is_complete_without_its_root(finished, tmp_path):
+    root = finished.run_dir / finished.records["generalist"].checkpoint
+    result = run_experiment(
+        toy_experiment(iterations=1, judge_envs=0, method="ppo", root=str(root)), tmp_path / "run", make_toy_env
+    )
+    copied = result.run_dir / result.records["root"].checkpoint
+    assert Path(result.run_dir) in copied.parents
+    assert load_checkpoint(copied).manifest["sha256"] == result.records["root"].sha256
+    assert read_record(result.run_dir, "continued").inputs == {"root": result.records["root"].sha256}

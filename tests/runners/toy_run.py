@@ -1,0 +1,78 @@
+"""A whole experiment on toy robots, small enough for a test; also the program that tests kill."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from eagle_rl.config.schema import (
+    AlgoCfg,
+    EvaluationCfg,
+    ExperimentCfg,
+    NetworkCfg,
+    ObservationsCfg,
+    PlanCfg,
+    RunCfg,
+    TaskCfg,
+)
+from eagle_rl.runners.stages import RunResult, run_experiment
+from tests.toy import FRAMES, ToyEnv
+
+ENVS, STEPS = 12, 4
+
+NETWORK = NetworkCfg(
+    embedding_dim=8, encoder_dims=(16,), estimator_dims=(16,), actor_dims=(16,), critic_dims=(16,), activation="elu"
+)
+
+
+class JudgedToyEnv(ToyEnv):
+    """The toy with what an evaluation asks of an environment."""
+
+    pinned: Tensor | None = None
+
+    def pin_commands(self, command: Tensor | None) -> None:
+        self.pinned = command
+        if command is not None:
+            self.command = command.float()
+
+    def _reset(self, ids: Tensor) -> None:
+        super()._reset(ids)
+        if self.pinned is not None:
+            self.command = self.pinned.float()
+
+    def tracking_errors(self) -> Tensor:
+        return (self.frames[:, 0, :5] - self.command).abs()
+
+
+def make_toy_env(robots: Sequence[str], num_envs: int, task: TaskCfg, seed: int) -> JudgedToyEnv:
+    return JudgedToyEnv(num_envs, tuple(robots), seed)
+
+
+def toy_experiment(iterations: int = 3, judge_envs: int = 4, **plan: object) -> ExperimentCfg:
+    """Three robots, a few iterations a stage."""
+    steps = ENVS * STEPS * iterations
+    budgets = {"generalist_env_steps": steps, "specialist_env_steps": steps, "distill_env_steps": steps}
+    return ExperimentCfg(
+        name="toy",
+        robots=("one", "two", "three"),
+        num_envs=ENVS,
+        task=TaskCfg(observations=ObservationsCfg(history_length=FRAMES)),
+        algo=AlgoCfg(num_steps_per_env=STEPS, num_learning_epochs=1, num_mini_batches=2, network=NETWORK),
+        plan=PlanCfg(**{"method": "eagle", "judge_envs_per_robot": judge_envs, **budgets, **plan}),  # type: ignore[arg-type]
+        evaluation=EvaluationCfg(num_steps=5),
+        run=RunCfg(save_interval=1),
+    )
+
+
+def parameters(result: RunResult) -> dict[str, Tensor]:
+    """Final weights of the generalist."""
+    return torch.load(result.generalist, weights_only=True)["algorithm"]["actor_state_dict"]
+
+
+if __name__ == "__main__":
+    folder = Path(sys.argv[1])
+    run_experiment(toy_experiment(), folder, make_toy_env, resume=folder.exists())
