@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from eagle_rl.config.commands import CommandScript, load_commands
 from eagle_rl.config.compose import known_names
+from eagle_rl.config.validate import CONTROL_STEP
 from eagle_rl.errors import CheckpointError, ConfigError
 
 if TYPE_CHECKING:
@@ -87,7 +88,7 @@ def _load(args: argparse.Namespace, checkpoint: Path, seconds: float) -> Session
         names = known_names("robots")
     if len(set(names)) < len(names):
         raise ConfigError(f"--robots {args.robots}: a robot is named twice.")
-    return Session(actor, cfg, names, num_steps=round(seconds / 0.02))
+    return Session(actor, cfg, names, num_steps=round(seconds / CONTROL_STEP))
 
 
 def main(argv: Sequence[str]) -> int:

@@ -27,6 +27,7 @@ class Session:
     A robot that falls starts again where it began.
 
     Attributes:
+        cfg: the experiment the policy comes from.
         specs: the robots.
         step_dt: control step [s].
         falls: times [s] at which each robot fell, by name.
@@ -34,6 +35,7 @@ class Session:
 
     def __init__(self, actor: EagleActor, cfg: ExperimentCfg, robots: Sequence[str], num_steps: int) -> None:
         """Place one environment per robot; none times out within ``num_steps`` control steps."""
+        self.cfg = cfg
         self.specs = [load_robot(name) for name in robots]
         protocol = dataclasses.replace(cfg.evaluation, num_steps=num_steps, randomization=False, noise=False)
         task = evaluation_task(cfg.task, protocol)

@@ -69,16 +69,15 @@ def help_text() -> str:
     return f"{keys}, Enter stands still"
 
 
-def watch(session: Session, script: CommandScript | None, seconds: float | None, ranges: CommandsCfg) -> None:
+def watch(session: Session, script: CommandScript | None, seconds: float | None) -> None:
     """Show robots until the window is closed.
 
     Args:
         session: the robots.
         script: what to command, over and over, or None for the keyboard.
         seconds: stop after so long, or None.
-        ranges: bounds of what the keyboard may ask for.
     """
-    keyboard = Keyboard(ranges)
+    keyboard = Keyboard(session.cfg.task.commands)
     stage = Stage(session.specs)
     if script is None:
         print(help_text())

@@ -6,7 +6,9 @@ import ctypes.util
 import os
 from collections.abc import Sequence
 from types import TracebackType
-from typing import Protocol, Self
+from typing import Protocol
+
+from typing_extensions import Self
 
 import mujoco
 import numpy as np
