@@ -8,27 +8,12 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console
 
-from eagle_rl.config.schema import RandomizationCfg, SimCfg
+from eagle_rl.config.schema import RandomizationCfg
 
 from .mdp_summary import make_table, randomization_table
 
 if TYPE_CHECKING:
     from envs.robots.spec import RobotSpec
-
-_JOINT_COLUMNS = (
-    "slot",
-    "joint",
-    "sign",
-    "zero",
-    "default",
-    "lower",
-    "upper",
-    "effort",
-    "velocity",
-    "kp",
-    "kd",
-    "armature",
-)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -65,22 +50,16 @@ def _slots(console: Console) -> None:
 
 
 def _show(spec: RobotSpec, console: Console) -> None:
-    from envs.robots.slots import SLOT_NAMES
+    from envs.robots.check import COLUMNS, describe
 
-    columns = (
-        *(spec.signs, spec.zero_offsets, spec.default_joint_pos, spec.joint_lower, spec.joint_upper),
-        *(spec.effort_limit, spec.velocity_limit, spec.stiffness, spec.damping, spec.armature),
-    )
-    rows = [
-        (SLOT_NAMES[spec.slots[i]], joint, *(f"{column[i]:g}" for column in columns))
-        for i, joint in enumerate(spec.joint_names)
-    ]
     title = f"{spec.title}: {spec.num_joints} joints, {spec.total_mass:.2f} kg, base at {spec.nominal_height:.3f} m"
-    console.print(make_table(f"{title} (rad, N m, rad/s, native signs)", _JOINT_COLUMNS, rows))
+    console.print(make_table(f"{title} (rad, N m, rad/s, native signs)", COLUMNS, describe(spec)))
     console.print()
     console.print(make_table("Links by role", ("role", "link"), spec.link_roles.items()))
     console.print(f"\nswing height {spec.swing_height:.3f} m, base {spec.base_link}, IMU on {spec.imu_link}")
     console.print(f"{spec.yaml_path}\n{spec.urdf_path}", highlight=False, soft_wrap=True)
+    for topic, source in spec.sources.items():
+        console.print(f"{topic}: {source}", highlight=False, markup=False)
 
 
 def _show_randomization(spec: RobotSpec, console: Console) -> None:
@@ -91,17 +70,16 @@ def _show_randomization(spec: RobotSpec, console: Console) -> None:
 
 
 def _check(name: str, console: Console) -> None:
-    """Load a robot and compile it: whatever is wrong with its files is raised as ``RobotError``."""
+    """Load and compile a robot: faults are raised as ``RobotError``, what is merely odd is printed."""
+    from envs.robots.check import check_robot
     from envs.robots.load import load_robot
-    from envs.robots.model import build_model
 
+    findings = check_robot(name)
     spec = load_robot(name)
-    model = build_model(spec, SimCfg())
-    console.print(
-        f"{spec.name}: in order: {spec.num_joints} joints in slots, {spec.total_mass:.3f} kg, "
-        f"{model.nbody - 1} bodies and {model.nu} actuators in MuJoCo",
-        highlight=False,
-    )
+    verdict = f"{len(findings)} findings" if findings else "in order"
+    console.print(f"{spec.name}: {spec.num_joints} joints, {spec.total_mass:.3f} kg: {verdict}", highlight=False)
+    for finding in findings:
+        console.print(f"  {finding}", highlight=False, markup=False)
 
 
 def main(argv: Sequence[str]) -> int:

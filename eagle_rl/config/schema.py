@@ -63,6 +63,8 @@ class ControlCfg:
     """The same bound for hip pitch, knee and ankle pitch, which must travel far to squat [-] (ours)."""
     hip_yaw_ratio: float = 0.5
     """Extra factor at hip yaw [-] (ours, from the single-robot study)."""
+    upper_ratio: float = 0.5
+    """Extra factor at waist, head and arms [-] (ours: the noise of a stiff waist turns the pelvis)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -316,6 +318,8 @@ class AidsCfg:
     """Control steps between updates of both scales."""
     min_episode_ratio: float = 0.6
     """The harness decays while the mean episode lasts this share of its full length."""
+    harness_contact_match: float = 0.7
+    """... and while foot contacts match the clock this often: dropped earlier, robots stand and never step (measured)."""
     min_contact_match: float = 0.8
     """Gait shaping decays while foot contacts match the clock this often."""
 

@@ -312,7 +312,11 @@ class EagleRunner(OnPolicyRunner):
         return bool(votes > 0)
 
     def _configure_multi_gpu(self) -> None:
-        """Join the processes torchrun started: gloo on the CPU, which rsl_rl refuses, nccl on GPUs."""
+        """Join the processes torchrun started: nccl where each has a GPU of its own, else gloo, which can share one.
+
+        rsl_rl itself refuses the CPU. Several processes on one GPU pay where the physics is the cost: while one learns
+        or waits for the GPU, another's physics has the cores.
+        """
         self.gpu_world_size = int(os.getenv("WORLD_SIZE", "1"))
         self.gpu_global_rank = int(os.getenv("RANK", "0"))
         self.gpu_local_rank = int(os.getenv("LOCAL_RANK", "0"))
@@ -327,6 +331,7 @@ class EagleRunner(OnPolicyRunner):
         }
         on_gpu = str(self.device).startswith("cuda")
         if on_gpu:
-            torch.cuda.set_device(self.device)
+            torch.cuda.set_device(torch.device(self.device).index or 0)
         if not torch.distributed.is_initialized():
-            torch.distributed.init_process_group("nccl" if on_gpu else "gloo")
+            own_gpu = on_gpu and torch.cuda.device_count() >= int(os.getenv("LOCAL_WORLD_SIZE", "1"))
+            torch.distributed.init_process_group("nccl" if own_gpu else "gloo")

@@ -29,9 +29,11 @@ _MAX_TILT_TORQUE = 120.0 / 33.0
 _TILT_DAMPING = 12.0 / 33.0
 """[N m s/rad/kg]; part of the physics step and so implicit: as a torque held over a control step it would shake a light
 pelvis apart."""
-_HEIGHT_STIFFNESS = 50.0
-"""[N/m/kg]: full support 0.1 m below the commanded height."""
-_MAX_SUPPORT = 0.5
+_SUPPORT = 0.35
+"""Share of the weight the harness carries at the commanded height [-]; it makes lifting a foot affordable."""
+_HEIGHT_STIFFNESS = 30.0
+"""Change of the support below and above that height [N/m/kg]."""
+_MAX_SUPPORT = 0.6
 """Share of the weight the harness carries at most [-]."""
 _DRAG = 1.0
 """[N s/m/kg]"""
@@ -64,9 +66,11 @@ class LearningAids:
         cfg = self.cfg
         self._episode_ratio = torch.lerp(self._episode_ratio, episode_ratio.to(self._episode_ratio), _SMOOTHING)
         self._contact_match = torch.lerp(self._contact_match, contact_match.to(self._contact_match), _SMOOTHING)
-        stands, walks = self._episode_ratio >= cfg.min_episode_ratio, self._contact_match >= cfg.min_contact_match
-        self.harness = _decayed(self.harness, stands, cfg.harness_decay)
-        self.gait_shaping = _decayed(self.gait_shaping, walks, cfg.gait_shaping_decay)
+        stands = self._episode_ratio >= cfg.min_episode_ratio
+        steps = self._contact_match >= cfg.harness_contact_match
+        walks = self._contact_match >= cfg.min_contact_match
+        self.harness = _decayed(self.harness, stands & steps, cfg.harness_decay)
+        self.gait_shaping = _decayed(self.gait_shaping, walks & (self.harness == 0.0), cfg.gait_shaping_decay)
 
     def state_dict(self) -> dict[str, Tensor]:
         """Both scales and the running means that decide about their decay."""
@@ -108,7 +112,8 @@ def _force(state: PooledState, robots: PooledRobots, mass: Tensor) -> Tensor:
     drag = _DRAG * mass * (state.command[:, :2] - state.base_lin_vel_b[:, :2])
     drag = _bounded(drag, _MAX_DRAG * _GRAVITY * mass)
     sag = (robots.nominal_height + state.command[:, 3] - state.base_height).unsqueeze(1)
-    support = torch.minimum(_HEIGHT_STIFFNESS * mass * sag, _MAX_SUPPORT * _GRAVITY * mass).clamp(min=0.0)
+    support = _SUPPORT * _GRAVITY * mass + _HEIGHT_STIFFNESS * mass * sag
+    support = torch.minimum(support, _MAX_SUPPORT * _GRAVITY * mass).clamp(min=0.0)
     return torch.cat((drag, support), dim=1)
 
 

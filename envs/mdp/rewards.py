@@ -21,7 +21,8 @@ from ..state import PooledRobots, PooledState
 from . import gait
 
 SHAPING_KAPPA = 1e4
-"""Widening of the contact-force kernel at full gait shaping [N^2]: 50 saturates at 20 N, where nothing is learned."""
+"""Widening of the contact-force kernel at full gait shaping for a robot of 33 kg [N^2], growing with the square of the
+weight: 50 saturates at 20 N, where nothing is learned."""
 SHAPING_WEIGHT = 2.0
 """Growth of the gait weights at full gait shaping [-]."""
 
@@ -99,7 +100,7 @@ def contact_force(state: PooledState, robots: PooledRobots, ctx: RewardContext) 
 
     The norm is over all three components, else a vertically loaded swing foot goes unpunished (HugWBC 11.2).
     """
-    kappa = ctx.cfg.contact_force_kappa + SHAPING_KAPPA * ctx.gait_shaping
+    kappa = ctx.cfg.contact_force_kappa + SHAPING_KAPPA * ctx.gait_shaping * (robots.total_mass / 33.0).square()
     loaded = 1.0 - _rho(_square_sum(state.foot_force_w), kappa.unsqueeze(1))
     return _dot(1.0 - ctx.contact_probability(state), loaded)
 

@@ -51,13 +51,10 @@ SENSOR_SLICES: dict[str, slice] = _slices()
 """Where each block lies in ``sensordata``; each reshapes to (owners, dim):
 
 - ``sole_pos``, ``sole_vel``: (2, 3) position [m] and velocity [m/s] of the sole centres, world frame, FEET order;
-- ``foot_force``: (2, 3) net contact force between each foot and the floor [N], world frame, see ``FORCE_ON_BODY``;
-- ``contact_force``: (7, 3) net contact force between each of COLLISION_LINKS and anything [N], likewise;
+- ``foot_force``: (2, 3) net contact force of the floor on each foot [N], world frame: z is positive in stance;
+- ``contact_force``: (7, 3) net contact force of anything on each of COLLISION_LINKS [N], world frame;
 - ``floor_contact``: (3,) number of contacts of each of FALL_LINKS with the floor.
 """
-
-FORCE_ON_BODY = -1.0
-"""Factor that turns a sensed contact force into the force on the body: MuJoCo gives what the body does to the other."""
 
 NUM_SENSORS: int = SENSOR_SLICES[_BLOCKS[-1].name].stop
 """Length of ``sensordata``."""
@@ -77,12 +74,13 @@ def add_sensors(world: mujoco.MjSpec, spec: RobotSpec) -> None:
 
 
 def _add_contact(world: mujoco.MjSpec, field: int, *, on: str, floor_only: bool) -> None:
-    """Sense what happens to body ``on``."""
-    against = {"reftype": mujoco.mjtObj.mjOBJ_GEOM, "refname": FLOOR} if floor_only else {}
+    """Sense what happens to body ``on``: MuJoCo reports the force of the first object on the second."""
+    kind, name = (mujoco.mjtObj.mjOBJ_GEOM, FLOOR) if floor_only else (mujoco.mjtObj.mjOBJ_XBODY, "world")
     world.add_sensor(
         type=mujoco.mjtSensor.mjSENS_CONTACT,
-        objtype=mujoco.mjtObj.mjOBJ_BODY,
-        objname=on,
+        objtype=kind,
+        objname=name,
+        reftype=mujoco.mjtObj.mjOBJ_BODY,
+        refname=on,
         intprm=[field, _REDUCE_NETFORCE, 1],
-        **against,
     )

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 class HeightField:
     """A grid of ground heights, centred on the world's origin.
 
-    Vertex (row, column) lies at x = (column - (columns - 1) / 2) * cell_size and y = (row - (rows - 1) / 2) * cell_size.
+    Vertex (row, column) lies at x = (column - (columns - 1) / 2) * cell_size and at y = (row - (rows - 1) / 2) *
+    cell_size.
     """
 
     heights: NDArray[np.float64]

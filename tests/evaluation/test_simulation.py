@@ -8,7 +8,7 @@ import pickle
 import torch
 
 from eagle_rl.cli.environment import make_env_factory
-from eagle_rl.config.schema import EvaluationCfg, RunCfg, TaskCfg
+from eagle_rl.config.schema import AidsCfg, EvaluationCfg, RunCfg, TaskCfg
 from eagle_rl.evaluation.evaluate import evaluate
 from tests.evaluation.fake import idle
 
@@ -17,7 +17,7 @@ MAKE_ENV = make_env_factory(RunCfg(num_threads=1))
 
 
 def test_pinned_commands_are_in_force_in_the_next_observation_and_stay_through_resets():
-    task = TaskCfg()
+    task = TaskCfg(aids=AidsCfg(harness=0.0))
     env = MAKE_ENV(["h1"], 2, task, 0)
     command = torch.tensor([[0.0, 0.0, 0.0, -0.2, 0.1], [1.0, 0.1, 0.3, 0.0, 0.0]])
     env.pin_commands(command)

@@ -77,3 +77,17 @@ def test_g1_ankles_have_the_vendors_present_torque() -> None:
     assert {rows[f"{side}_ankle_{axis}"]["effort"] for side in ("left", "right") for axis in ("pitch", "roll")} == {
         "35"
     }
+
+
+def test_the_documented_slot_table_is_the_one_in_the_files() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "robots.md").read_text(encoding="utf-8")
+    rows = [[cell.strip() for cell in line.split("|")[2:-1]] for line in text.splitlines() if line.startswith("| ")]
+    documented = {row[0]: row[1:] for row in rows if row[0] in SLOT_NAMES}
+    assert list(documented) == list(SLOT_NAMES)
+    for column, name in enumerate(ROBOTS):
+        for row in describe(shipped(name)):
+            cells = dict(zip(COLUMNS, row, strict=True))
+            cell = documented[cells["slot"]][column]
+            assert cell.split(" ")[0].strip("`") == cells["joint"], f"{name} {cells['slot']}"
+            assert ("sign -" in cell) == (cells["sign"] == "-" and cells["joint"] != "-"), f"{name} {cells['slot']}"
+            assert ("zero" in cell) == (cells["zero"] not in ("0", "-")), f"{name} {cells['slot']}"

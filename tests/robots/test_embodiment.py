@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from eagle_rl.config.schema import SimCfg
+from envs.mdp.layout import EMBODIMENT
 from envs.robots.embodiment import (
     EMBODIMENT_LINKS,
     LINK_DIM,
@@ -139,6 +140,14 @@ def test_standardisation_commutes_with_the_mirror() -> None:
     np.testing.assert_allclose(mirrored(mean, sign=True), mean, atol=1e-15)
     np.testing.assert_allclose(mirrored(std, sign=False), std, rtol=1e-12)
     assert std.min() > 0.0
+
+
+def test_the_observations_mirror_is_that_of_the_body() -> None:
+    values = np.arange(1.0, 31.0).reshape(3, LINK_DIM)
+    layout = EMBODIMENT["paper"]
+    ours = mirrored(values, sign=True).ravel()
+    np.testing.assert_array_equal(values.ravel()[list(layout.perm)] * np.array(layout.sign), ours)
+    assert len(EMBODIMENT["extended"].perm) == embodiment_dim("extended")
 
 
 @robots

@@ -11,7 +11,7 @@ import pytest
 from eagle_rl.config.schema import SimCfg
 from envs.robots.load import load_robot
 from envs.robots.model import KEYFRAME, add_floor, build_model, build_spec, set_options
-from envs.robots.sensors import FORCE_ON_BODY, NUM_SENSORS, SENSOR_SLICES
+from envs.robots.sensors import NUM_SENSORS, SENSOR_SLICES
 from envs.robots.slots import SLOT_NAMES
 from envs.robots.spec import COLLISION_LINKS, FEET, Array, RobotSpec
 from envs.sim.height_field import HeightField
@@ -113,7 +113,7 @@ def test_foot_forces_carry_the_weight_of_a_robot_at_rest(name: str) -> None:
     for _ in range(500):
         mujoco.mj_step(model, data)
     mujoco.mj_forward(model, data)
-    force = FORCE_ON_BODY * _read(data, "foot_force")
+    force = _read(data, "foot_force")
     assert model.nsensordata == NUM_SENSORS
     assert force[:, 2].sum() == pytest.approx(weight, rel=0.02)
     assert force[:, 2].min() > 0.3 * weight
@@ -166,7 +166,24 @@ def test_a_falling_robot_reports_its_torso_and_a_push_reports_the_link(tmp_path:
     mujoco.mj_forward(model, data)
     torso = COLLISION_LINKS.index("torso")
     assert (_read(data, "floor_contact") > 0).tolist() == [True, False, True], "torso, pelvis, head (on the torso)"
-    assert (FORCE_ON_BODY * _read(data, "contact_force"))[torso, 2] > 0.0
+    assert _read(data, "contact_force")[torso, 2] > 0.0
+
+
+def test_contact_forces_are_those_on_the_body(tmp_path: Path) -> None:
+    """Against MuJoCo's own sum of external forces, with thighs pressing on each other and feet on the ground."""
+    spec = load_robot(write_biped(tmp_path))
+    model = build_model(spec, SimCfg())
+    model.body_pos[[model.body(f"{side}_thigh").id for side in FEET], 1] = [0.03, -0.03]
+    data = _start(model)
+    data.qpos[2] -= 0.001
+    mujoco.mj_forward(model, data)
+    mujoco.mj_rnePostConstraint(model, data)
+    links = [spec.link_roles[role] for role in COLLISION_LINKS]
+    expected = np.array([data.body(link).cfrc_ext[3:] for link in links])
+    assert np.abs(expected).max() > 1.0
+    np.testing.assert_allclose(_read(data, "contact_force"), expected, atol=1e-6)
+    feet = np.array([data.body(f"{side}_foot").cfrc_ext[3:] for side in FEET])
+    np.testing.assert_allclose(_read(data, "foot_force")[:, 2], feet[:, 2], atol=1e-6)
 
 
 @pytest.mark.parametrize("self_collision", [True, False])
