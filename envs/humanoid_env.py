@@ -55,6 +55,8 @@ class HumanoidEnv(VecEnv):
     """
 
     num_actions = NUM_SLOTS
+    final_observations_of_falls = False
+    """Whether ``final_ids`` also lists environments that terminated; the learner has no use for those."""
 
     def __init__(
         self,
@@ -168,7 +170,7 @@ class HumanoidEnv(VecEnv):
         rewards = torch.where(sick, torch.zeros_like(rewards), rewards)
 
         self._observe()
-        final_ids = time_outs.nonzero().squeeze(1)
+        final_ids = (dones if self.final_observations_of_falls else time_outs).nonzero().squeeze(1)
         extras: dict[str, Any] = {"time_outs": time_outs, "final_ids": final_ids}
         extras["final_observations"] = self._groups(final_ids)
         extras["log"] = self._account(terms, reasons | {"sick": sick}, dones, time_outs)
@@ -177,6 +179,10 @@ class HumanoidEnv(VecEnv):
             self._reset(reset_ids)
         self._resample()
         return self._groups(None), rewards.float(), dones, extras
+
+    def reset(self) -> None:
+        """Start new episodes everywhere; random streams go on."""
+        self._reset(self._all)
 
     def get_observations(self) -> TensorDict:
         """Observation groups at the present state, fresh tensors."""
