@@ -51,8 +51,12 @@ class StepLog:
             *("match", "moving", "falls", "dones"),
         ]
         rows = torch.stack(
-            [*terms.values(), *(reason.to(errors.dtype) for reason in reasons.values()), *errors.unbind(1)]
-            + [contact_match * moving, moving, falls.to(errors.dtype), dones.to(errors.dtype)],
+            [
+                *terms.values(),
+                *(reason.to(errors.dtype) for reason in reasons.values()),
+                *errors.unbind(1),
+                *(contact_match * moving, moving, falls.to(errors.dtype), dones.to(errors.dtype)),
+            ],
             dim=1,
         ).double()
         if self._sums is None:
@@ -88,7 +92,11 @@ class StepLog:
 
     def state_dict(self) -> dict[str, Any]:
         """The sums of the unfinished interval."""
-        return {"sums": None if self._sums is None else self._sums.clone(), "steps": self._steps, "columns": self._columns}
+        return {
+            "sums": None if self._sums is None else self._sums.clone(),
+            "steps": self._steps,
+            "columns": self._columns,
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`state_dict` returned."""
