@@ -210,9 +210,7 @@ class HumanoidVectorEnv(gymnasium.vector.VectorEnv[dict[str, Array], Array, NDAr
         groups = self._sim.reset(seed, self.np_random)
         return _observation(groups, self.single_observation_space), self._info(groups)
 
-    def step(
-        self, actions: Array
-    ) -> tuple[dict[str, Array], NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
+    def step(self, actions: Array) -> tuple[dict[str, Array], NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
         """Advance 0.02 s; ``info["final_obs"]`` holds the true last observations of episodes that ended."""
         groups, rewards, terminations, truncations, extras = self._sim.step(actions)
         info = self._info(groups)
@@ -240,6 +238,4 @@ class HumanoidVectorEnv(gymnasium.vector.VectorEnv[dict[str, Array], Array, NDAr
         }
 
 
-gymnasium.register(
-    ENV_ID, entry_point=f"{__name__}:HumanoidGymEnv", vector_entry_point=f"{__name__}:HumanoidVectorEnv"
-)
+gymnasium.register(ENV_ID, entry_point=f"{__name__}:HumanoidGymEnv", vector_entry_point=f"{__name__}:HumanoidVectorEnv")

@@ -177,5 +177,10 @@ def _add_floor(spec: mujoco.MjSpec) -> None:
     textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "tiles"
     tiles.textures = textures
     spec.worldbody.add_geom(
-        name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0.0, 0.0, 0.05], material="tiles", contype=0, conaffinity=0
+        name="floor",
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=[0.0, 0.0, 0.05],
+        material="tiles",
+        contype=0,
+        conaffinity=0,
     )
