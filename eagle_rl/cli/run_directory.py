@@ -21,8 +21,9 @@ _README = """\
 
 config.yaml       every value of this run; eagle train {here}/config.yaml runs it again
 provenance.json   versions, seed, commit, robots' files, command line; uncommitted.diff if there was one
-metrics.jsonl     one line of numbers per iteration; the same numbers for TensorBoard beside it
-checkpoints/      what was learned
+plan.json         the stages of the run and what each starts from
+stages/           of each stage: stage.json (state, inputs, cost), checkpoints/, evaluation.json, and metrics.jsonl, one
+                  line of numbers per iteration, with the same numbers for TensorBoard beside it
 
 Watch the curves   tensorboard --logdir {here}
 Progress           eagle status {here}

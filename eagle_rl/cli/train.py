@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from eagle_rl.config.compose import known_names
 from eagle_rl.config.load import config_hash, load_experiment, to_yaml
@@ -16,6 +16,11 @@ from eagle_rl.runners.provenance import Provenance, content_hash, slot_table_has
 
 from .provenance import provenance
 from .run_directory import check_drift, create_run, open_run
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from eagle_rl.runners.team import Team
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -96,8 +101,12 @@ def main(argv: Sequence[str]) -> int:
     if args.resume is not None:
         check_drift(args.resume, request.changes, record, args.allow_drift)
     _prepare_torch(cfg)
-    run_dir = args.resume or create_run(cfg, args.out, record)
-    return _train(cfg, run_dir, args, record)
+
+    from eagle_rl.runners.team import Team
+
+    team = Team(cfg.run.device)
+    run_dir = args.resume or team.agree(lambda: create_run(cfg, args.out, record))
+    return _train(cfg, run_dir, args, record, team)
 
 
 def _identity(record: dict[str, Any]) -> Provenance:
@@ -108,7 +117,7 @@ def _identity(record: dict[str, Any]) -> Provenance:
     return Provenance(robots=robots, slot_table_hash=slot_table_hash(SLOT_NAMES))
 
 
-def _train(cfg: ExperimentCfg, run_dir: Path, args: argparse.Namespace, record: dict[str, Any]) -> int:
+def _train(cfg: ExperimentCfg, run_dir: Path, args: argparse.Namespace, record: dict[str, Any], team: Team) -> int:
     from rich.console import Console
 
     from eagle_rl.runners.stages import run_experiment
@@ -116,7 +125,7 @@ def _train(cfg: ExperimentCfg, run_dir: Path, args: argparse.Namespace, record: 
     from .environment import make_env_factory
     from .mdp_summary import print_mdp
 
-    console = Console()
+    console = Console(quiet=not team.leads)
     print_mdp(cfg.task, console)
     console.print(f"{cfg.name}: {cfg.description}\nrun directory: {run_dir}", highlight=False)
     run_experiment(
@@ -128,10 +137,25 @@ def _train(cfg: ExperimentCfg, run_dir: Path, args: argparse.Namespace, record: 
         console=console,
         provenance=_identity(record),
         allow_drift=args.allow_drift,
+        team=team,
     )
+    _print_scores(run_dir, console)
     console.print(
         f"\nWatch it:     eagle play {run_dir}\nMeasure it:   eagle evaluate {run_dir}\n"
         f"Curves:       tensorboard --logdir {run_dir}\nGo on:        eagle train --resume {run_dir}",
         highlight=False,
     )
     return 0
+
+
+def _print_scores(run_dir: Path, console: Console) -> None:
+    """The tracking table of the stages that were judged."""
+    from rich.markdown import Markdown
+
+    from eagle_rl.evaluation.render import to_markdown
+    from eagle_rl.evaluation.report import tracking_table
+    from eagle_rl.runners.judged import judged_results
+
+    results = judged_results(run_dir)
+    if results:
+        console.print(Markdown(to_markdown(tracking_table(results, paper={}))))
