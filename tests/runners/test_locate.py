@@ -7,7 +7,7 @@ import pytest
 from eagle_rl.errors import CheckpointError
 from eagle_rl.runners.judged import judged_results
 from eagle_rl.runners.locate import find_checkpoint
-from eagle_rl.runners.records import stage_dir
+from eagle_rl.runners.records import read_plan, stage_dir
 from eagle_rl.runners.stages import run_experiment
 from tests.runners.toy_run import make_toy_env, toy_experiment
 
@@ -38,6 +38,6 @@ def test_a_folder_without_checkpoints_is_refused_in_words(tmp_path):
 
 
 def test_scores_of_a_run_are_rows_with_all_specialists_in_one(run):
-    rows = judged_results(run.run_dir)
-    assert list(rows) == ["generalist", "round 1 specialists", "round 1 generalist"]
-    assert [list(result.robots) for result in rows["round 1 specialists"]] == [["one"], ["two"], ["three"]]
+    rows = judged_results(run.run_dir, read_plan(run.run_dir))
+    assert list(rows) == ["generalist", "specialist, round 1", "generalist, round 1"]
+    assert [list(result.robots) for result in rows["specialist, round 1"]] == [["one"], ["two"], ["three"]]
