@@ -14,7 +14,6 @@ from eagle_rl.errors import ConfigError
 
 if TYPE_CHECKING:
     from eagle_rl.evaluation.plots import Figure
-
     from eagle_rl.models import EagleActor
 
 FIGURES = {
