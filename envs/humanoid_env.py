@@ -18,7 +18,7 @@ from .mdp.aids import LearningAids, harness_damping, harness_wrench
 from .mdp.commands import CommandSampler
 from .mdp.curriculum import penalty_scale
 from .mdp.gait import advance_phase, clock, foot_phases
-from .mdp.metrics import contact_match, tracking_errors
+from .mdp.metrics import contact_match, measured_commands, tracking_errors
 from .mdp.observations import (
     History,
     ObservationLayout,
@@ -153,8 +153,8 @@ class HumanoidEnv(VecEnv):
         self._last_last_actions, self._last_actions = self._last_actions, self._actions
         self._actions = actions.to(self._actions.dtype).clamp(-clip, clip) * self.robots.slot_mask
         self.randomizer.push(self.step_count, self.penalty_scale, self.step_dt)
-        targets = self.robots.default_joint_pos + self.robots.action_scale * self._actions + self.randomizer.motor_offset
-        staged = self.pool.step(targets, self._harness())
+        targets = self.robots.default_joint_pos + self.robots.action_scale * self._actions
+        staged = self.pool.step(targets + self.randomizer.motor_offset, self._harness())
         self.common_step_counter += 1
         self.episode_length_buf = self.episode_length_buf + 1
         self.step_count += 1
@@ -191,6 +191,10 @@ class HumanoidEnv(VecEnv):
     def tracking_errors(self) -> Tensor:
         """Absolute error of each command at the last step [m/s, m/s, rad/s, m, rad], shape (N, 5)."""
         return tracking_errors(self.state, self.robots)
+
+    def measured_commands(self) -> Tensor:
+        """What each command asks for, as it is now [m/s, m/s, rad/s, m, rad], shape (N, 5)."""
+        return measured_commands(self.state, self.robots)
 
     def pin_commands(self, command: Tensor | None) -> None:
         """Hold these commands, shape (N, 5), instead of sampling; ``None`` returns to sampling at the next draw."""
