@@ -17,7 +17,7 @@ from torch import Tensor
 from eagle_rl.errors import CheckpointError
 from eagle_rl.models import EagleActor
 from eagle_rl.models.actor import ExportedActor
-from eagle_rl.runners.checkpoint import write_atomically
+from eagle_rl.runners.files import write_atomically
 
 from .contract import DIGEST_KEY, METADATA_KEY, Contract
 
