@@ -399,9 +399,9 @@ class HumanoidEnv(VecEnv):
         """Restore what :meth:`state_dict` returned, in an environment built from the same configuration and seed."""
         self.common_step_counter = state["common_step_counter"]
         for name, value in state["buffers"].items():
-            setattr(self, name, value.to(self.device))
+            setattr(self, name, value.to(self.device, copy=True))
         self.state = PooledState(**{name: value.to(self.device) for name, value in state["state"].items()})
-        self.history.frames = state["history"].to(self.device)
+        self.history.frames = state["history"].to(self.device, copy=True)
         self.randomizer.load_state_dict(state["randomizer"])
         self.pool.load_state_dict(state["pool"])
         self.commands.load_state_dict(state["commands"])
