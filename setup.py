@@ -1,4 +1,4 @@
-"""Packaging. ``cfg`` and ``assets`` live at the top of the repository and travel in the package as ``eagle_rl/data``."""
+"""Packaging. ``cfg`` and ``assets`` live at the top of the repository and travel inside the package."""
 
 from __future__ import annotations
 
@@ -71,8 +71,7 @@ setup(
     extras_require={
         "dev": [
             "build>=1.0",
-            "setuptools>=68",
-            "wheel>=0.40",
+            "setuptools>=70.1",
             "pytest>=8.0",
             "pytest-cov>=5.0",
             "pytest-xdist>=3.5",

@@ -18,7 +18,7 @@ from .mdp.aids import LearningAids, harness_damping, harness_wrench
 from .mdp.commands import CommandSampler
 from .mdp.curriculum import penalty_scale
 from .mdp.gait import advance_phase, clock, foot_phases
-from .mdp.metrics import contact_match, tracking_errors
+from .mdp.metrics import contact_match, measured_commands, tracking_errors
 from .mdp.observations import (
     History,
     ObservationLayout,
@@ -55,6 +55,8 @@ class HumanoidEnv(VecEnv):
     """
 
     num_actions = NUM_SLOTS
+    final_observations_of_falls = False
+    """Whether ``final_ids`` also lists environments that terminated; the learner has no use for those."""
 
     def __init__(
         self,
@@ -151,8 +153,8 @@ class HumanoidEnv(VecEnv):
         self._last_last_actions, self._last_actions = self._last_actions, self._actions
         self._actions = actions.to(self._actions.dtype).clamp(-clip, clip) * self.robots.slot_mask
         self.randomizer.push(self.step_count, self.penalty_scale, self.step_dt)
-        targets = self.robots.default_joint_pos + self.robots.action_scale * self._actions + self.randomizer.motor_offset
-        staged = self.pool.step(targets, self._harness())
+        targets = self.robots.default_joint_pos + self.robots.action_scale * self._actions
+        staged = self.pool.step(targets + self.randomizer.motor_offset, self._harness())
         self.common_step_counter += 1
         self.episode_length_buf = self.episode_length_buf + 1
         self.step_count += 1
@@ -168,7 +170,7 @@ class HumanoidEnv(VecEnv):
         rewards = torch.where(sick, torch.zeros_like(rewards), rewards)
 
         self._observe()
-        final_ids = time_outs.nonzero().squeeze(1)
+        final_ids = (dones if self.final_observations_of_falls else time_outs).nonzero().squeeze(1)
         extras: dict[str, Any] = {"time_outs": time_outs, "final_ids": final_ids}
         extras["final_observations"] = self._groups(final_ids)
         extras["log"] = self._account(terms, reasons | {"sick": sick}, dones, time_outs)
@@ -178,6 +180,10 @@ class HumanoidEnv(VecEnv):
         self._resample()
         return self._groups(None), rewards.float(), dones, extras
 
+    def reset(self) -> None:
+        """Start new episodes everywhere; random streams go on."""
+        self._reset(self._all)
+
     def get_observations(self) -> TensorDict:
         """Observation groups at the present state, fresh tensors."""
         return self._groups(None)
@@ -185,6 +191,10 @@ class HumanoidEnv(VecEnv):
     def tracking_errors(self) -> Tensor:
         """Absolute error of each command at the last step [m/s, m/s, rad/s, m, rad], shape (N, 5)."""
         return tracking_errors(self.state, self.robots)
+
+    def measured_commands(self) -> Tensor:
+        """What each command asks for, as it is now [m/s, m/s, rad/s, m, rad], shape (N, 5)."""
+        return measured_commands(self.state, self.robots)
 
     def pin_commands(self, command: Tensor | None) -> None:
         """Hold these commands, shape (N, 5), instead of sampling; ``None`` returns to sampling at the next draw."""

@@ -11,8 +11,10 @@ ERROR_NAMES = ("E_vx", "E_vy", "E_omega", "E_h", "E_p")
 
 
 def episode_ratio(falls_per_step: Tensor, max_episode_length: int) -> Tensor:
-    """Mean episode length over the full length at a constant rate of falls, ``(1 - exp(-x)) / x``; unlike the mean of
-    finished episodes it does not wait for the long ones to finish. Shapes (R,)."""
+    """Mean episode length over the full length at a constant rate of falls, ``(1 - exp(-x)) / x``, shape (R,).
+
+    Unlike the mean of finished episodes it does not wait for the long ones to finish.
+    """
     falls = (falls_per_step * max_episode_length).clamp(min=1e-6)
     return -torch.expm1(-falls) / falls
 
@@ -49,8 +51,12 @@ class StepLog:
             *("match", "moving", "falls", "dones"),
         ]
         rows = torch.stack(
-            [*terms.values(), *(reason.to(errors.dtype) for reason in reasons.values()), *errors.unbind(1)]
-            + [contact_match * moving, moving, falls.to(errors.dtype), dones.to(errors.dtype)],
+            [
+                *terms.values(),
+                *(reason.to(errors.dtype) for reason in reasons.values()),
+                *errors.unbind(1),
+                *(contact_match * moving, moving, falls.to(errors.dtype), dones.to(errors.dtype)),
+            ],
             dim=1,
         ).double()
         if self._sums is None:
@@ -86,7 +92,11 @@ class StepLog:
 
     def state_dict(self) -> dict[str, Any]:
         """The sums of the unfinished interval."""
-        return {"sums": None if self._sums is None else self._sums.clone(), "steps": self._steps, "columns": self._columns}
+        return {
+            "sums": None if self._sums is None else self._sums.clone(),
+            "steps": self._steps,
+            "columns": self._columns,
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`state_dict` returned."""

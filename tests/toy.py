@@ -1,6 +1,6 @@
 """A stand-in for the simulator: three robots must bring their pitch joints to the command, the others to zero.
 
-``x' = x + 0.1 a / m`` for the joints a robot has; the mass m is seen by the critic and must be estimated by the actor.
+``x' = x + GAIN a / m`` for the joints a robot has; the mass m is seen by the critic and must be estimated by the actor.
 The task is its own mirror image. It honours the whole interface of the humanoid environment; its random numbers are its
 own.
 """
@@ -18,9 +18,12 @@ from envs.rng import CounterRng
 from envs.robots.slots import MIRROR_PERMUTATION, MIRROR_SIGN, NUM_SLOTS
 
 FRAMES = 3
-ROBOTS = {"one": (12, 0.5), "two": (15, 1.0), "three": (32, 2.0)}
+ROBOTS = {"one": (12, 0.5), "two": (15, 0.7), "three": (32, 1.0)}
 """Joints and mass of each robot."""
 EPISODE_LENGTH = 16
+GAIN = 0.3
+START = 0.2
+"""Bound of the joints after a reset."""
 
 
 class ToyEnv(VecEnv):
@@ -66,7 +69,7 @@ class ToyEnv(VecEnv):
         return TensorDict(groups, batch_size=[self.num_envs])
 
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
-        moved = self.frames[:, 0] + 0.1 * actions.clamp(-3, 3) / self.mass * self.mask
+        moved = self.frames[:, 0] + GAIN * actions.clamp(-3, 3) / self.mass * self.mask
         self.frames = torch.cat([moved[:, None], self.frames[:, :-1]], dim=1)
         goal = self.command[:, :1] * self.pitch
         error = ((moved - goal).square() * self.mask).sum(1) / self.mask.sum(1)
@@ -92,6 +95,6 @@ class ToyEnv(VecEnv):
         self.resets = self.resets.index_add(0, ids, torch.ones_like(ids))
         draw = self.rng.uniform_in(-1.0, 1.0, "reset", self.resets[ids], NUM_SLOTS + 5, ids)
         self.command = self.command.index_copy(0, ids, draw[:, NUM_SLOTS:])
-        frames = (draw[:, None, :NUM_SLOTS] * self.mask[ids, None]).expand(-1, FRAMES, -1)
+        frames = (START * draw[:, None, :NUM_SLOTS] * self.mask[ids, None]).expand(-1, FRAMES, -1)
         self.frames = self.frames.index_copy(0, ids, frames.contiguous())
         self.episode_length_buf = self.episode_length_buf.index_fill(0, ids, 0)

@@ -21,12 +21,12 @@ class RunningMeans:
 
     @torch.no_grad()
     def add(self, values: Mapping[str, Tensor | float]) -> None:
-        """Add one value to each tag."""
+        """Add one value, a float or a tensor without dimensions, to each tag."""
         if not values:
             return
         tags = tuple(values)
         device = next((v.device for v in values.values() if isinstance(v, Tensor)), torch.device("cpu"))
-        row = torch.stack([torch.as_tensor(v, device=device).detach().float().mean() for v in values.values()])
+        row = torch.stack([torch.as_tensor(v, dtype=torch.float32, device=device) for v in values.values()])
         known = ~row.isnan()
         row = torch.stack([row.nan_to_num(0.0, float("inf"), float("-inf")), known.to(row.dtype)])
         self._rows[tags] = self._rows[tags] + row if tags in self._rows else row

@@ -11,7 +11,6 @@ import contextlib
 import hashlib
 import io
 import json
-import os
 import re
 import warnings
 import zipfile
@@ -24,6 +23,8 @@ import torch
 
 from eagle_rl.errors import CheckpointError
 from eagle_rl.models import EagleActor
+from eagle_rl.runners import published
+from eagle_rl.runners.files import write_atomically
 from eagle_rl.runners.provenance import Provenance
 
 FORMAT_VERSION = 1
@@ -83,6 +84,13 @@ def save_checkpoint(
     return path
 
 
+def mark_stage_end(path: Path) -> Path:
+    """Mark a checkpoint that exists as the last of its stage; only its manifest is replaced."""
+    manifest = verify_checkpoint(path) | {"stage_end": True}
+    write_atomically(path.with_suffix(".json"), _encode_manifest(manifest))
+    return path
+
+
 def load_checkpoint(path: Path, slot_table_hash: str | None = None, device: str | torch.device = "cpu") -> Checkpoint:
     """Read a checkpoint whole and return it only if everything about it is sound.
 
@@ -94,25 +102,44 @@ def load_checkpoint(path: Path, slot_table_hash: str | None = None, device: str 
     path = Path(path).with_suffix(".pt")
     manifest = read_manifest(path)
     data = _read_verified(path, manifest)
-    if slot_table_hash is not None and manifest["slot_table_hash"] != slot_table_hash:
-        raise CheckpointError(
-            f"{path}: made for another slot table ({manifest['slot_table_hash'][:12]}), "
-            f"expected {slot_table_hash[:12]}: its actions would move the wrong joints. Use the version that wrote it."
-        )
+    _require_slot_table(path, manifest, slot_table_hash)
     return Checkpoint(path, manifest, _unpickle(path, data, device))
 
 
 def load_actor(
     path: Path, device: str | torch.device = "cpu", slot_table_hash: str | None = None
 ) -> tuple[EagleActor, Manifest]:
-    """The policy of a checkpoint, in evaluation mode, and the manifest with the resolved ``config``."""
-    checkpoint = load_checkpoint(path, slot_table_hash)
+    """The policy of a checkpoint or of a published file, in evaluation mode, and its manifest with the ``config``.
+
+    Args:
+        path: a checkpoint, or a file :func:`publish_policy` wrote.
+        device: where the policy computes.
+        slot_table_hash: refuse policies of another slot table, if given.
+    """
+    path = Path(path)
+    if path.suffix == published.SUFFIX:
+        weights, architecture, manifest = published.read_published(path)
+        _require_slot_table(path, manifest, slot_table_hash)
+    else:
+        checkpoint = load_checkpoint(path, slot_table_hash)
+        manifest, architecture = checkpoint.manifest, checkpoint.state.get("architecture", {})
+        weights = checkpoint.state.get("algorithm", {}).get("actor_state_dict", {})
     try:
-        actor = EagleActor.from_architecture(checkpoint.state["architecture"])
-        actor.load_state_dict(checkpoint.state["algorithm"]["actor_state_dict"])
-    except (KeyError, TypeError, RuntimeError, ValueError) as error:
-        raise CheckpointError(f"{checkpoint.path}: does not hold a policy of this version: {error}") from error
-    return actor.to(device).eval(), checkpoint.manifest
+        with torch.device("meta"):  # claims no memory, whatever sizes the file names
+            actor = EagleActor.from_architecture(architecture)
+        actor.load_state_dict(weights, assign=True)
+    except (KeyError, TypeError, AttributeError, RuntimeError, ValueError) as error:
+        raise CheckpointError(f"{path}: does not hold a policy of this version: {error}") from error
+    return actor.to(device).eval(), manifest
+
+
+def publish_policy(path: Path, target: Path) -> Path:
+    """Write the policy of a checkpoint as safetensors and return the path of the file."""
+    checkpoint = load_checkpoint(path)
+    target = target.with_suffix(published.SUFFIX)
+    weights = checkpoint.state["algorithm"]["actor_state_dict"]
+    published.write_published(target, weights, checkpoint.state["architecture"], checkpoint.manifest)
+    return target
 
 
 def read_manifest(path: Path) -> Manifest:
@@ -162,13 +189,15 @@ def best_checkpoint(folder: Path) -> Path | None:
 
 
 def prune_checkpoints(folder: Path, keep: int) -> None:
-    """Delete all but the last ``keep``, the best, and the ends of stages."""
+    """Delete all but the last ``keep``, the best, and the ends of stages; and what an interrupted save left behind."""
     manifests = _manifests(folder)
     last = sorted(manifests, key=iteration_of)[-keep:]
     for path in set(manifests) - {*last, best_checkpoint(folder)}:
         if not manifests[path]["stage_end"]:
             path.with_suffix(".json").unlink(missing_ok=True)
             path.unlink(missing_ok=True)
+    for leftover in folder.glob(".model_*.tmp"):
+        leftover.unlink(missing_ok=True)
 
 
 def iteration_of(path: Path) -> int:
@@ -179,22 +208,14 @@ def iteration_of(path: Path) -> int:
     return int(match[1])
 
 
-def write_atomically(path: Path, data: bytes) -> None:
-    """Replace ``path`` by ``data``: at any moment it is the old file or the new one, also after a power cut."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with temporary.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
-    descriptor = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+def _require_slot_table(path: Path, manifest: Manifest, expected: str | None) -> None:
+    """Refuse a policy whose slots mean other joints."""
+    got = manifest["slot_table_hash"]
+    if expected is not None and got != expected:
+        raise CheckpointError(
+            f"{path}: made for another slot table ({got[:12]}), expected {expected[:12]}: "
+            "its actions would move the wrong joints. Use the version that wrote it."
+        )
 
 
 def _encode_manifest(manifest: Manifest) -> bytes:

@@ -88,7 +88,8 @@ class EagleRunner(OnPolicyRunner):
         self.env_steps = 0
         self.wall_time = 0.0
         self._score: float | None = None
-        self._saved_iteration: int | None = None
+        self._saved: Path | None = None
+        """Checkpoint that holds the present state."""
 
     # --- training ---------------------------------------------------------------------------------------------------
 
@@ -125,25 +126,23 @@ class EagleRunner(OnPolicyRunner):
                     self.logger.write(self.current_learning_iteration, scalars)
                     if self.gpu_global_rank == 0:
                         progress.update(self.current_learning_iteration, self.env_steps, scalars)
-                    self._save_now_and_then(scalars)
+                    self._score = scalars.get("Train/mean_reward")
+                    if self.current_learning_iteration < last:
+                        self._save_now_and_then()
                     on_iteration(self.current_learning_iteration)
                     if self._any_process(interrupt.requested):
-                        raise Interrupted(f"Interrupted after iteration {self.current_learning_iteration}.")
-        except Interrupted:
-            self.save()
-            raise
+                        done = self.current_learning_iteration
+                        raise Interrupted(f"Interrupted after iteration {done}, saved as {self.save()}.")
         except HealthError:
             if not self.is_distributed:  # the other processes cannot be asked for their part of the state
                 self.save()
             raise
-        finally:
-            self.logger.close()
         return self.save(stage_end=True)
 
     def _iterate(self) -> dict[str, float]:
         """Collect one rollout and learn from it; return the iteration's scalars by tag."""
         start = time.perf_counter()
-        with torch.inference_mode():
+        with torch.no_grad():  # not inference_mode: the environment keeps its tensors and may change them in place
             for _ in range(self.cfg["num_steps_per_env"]):
                 self._step()
             self.alg.compute_returns(self._obs)
@@ -151,6 +150,7 @@ class EagleRunner(OnPolicyRunner):
         losses = self.alg.update()
         learned = time.perf_counter()
         self.current_learning_iteration += 1
+        self._saved = None
         steps = self.cfg["num_steps_per_env"] * self.env.num_envs * self.gpu_world_size
         self.env_steps += steps
         self.wall_time += learned - start
@@ -183,17 +183,23 @@ class EagleRunner(OnPolicyRunner):
     # --- checkpoints ------------------------------------------------------------------------------------------------
 
     def save(self, stage_end: bool = False) -> Path | None:
-        """Write a checkpoint and return its path; None in processes that do not write.
+        """Write a checkpoint, unless one holds this state already, and return its path.
 
-        A checkpoint of this iteration that exists already is kept, unless it is now to be marked as a stage's end.
+        Args:
+            stage_end: mark it as the end of its stage, which is never pruned.
+
+        Returns:
+            None in processes that do not write.
         """
         state = self._state()
-        if self.folder is None or (self._saved_iteration == self.current_learning_iteration and not stage_end):
+        if self.folder is None:
             return None
         self._require_finite_parameters()
         folder = self.folder / "checkpoints"
         try:
-            path = ckpt.save_checkpoint(
+            if self._saved is not None:
+                return ckpt.mark_stage_end(self._saved) if stage_end else self._saved
+            self._saved = ckpt.save_checkpoint(
                 folder,
                 state,
                 self.provenance,
@@ -205,8 +211,7 @@ class EagleRunner(OnPolicyRunner):
             ckpt.prune_checkpoints(folder, self.cfg["keep_checkpoints"])
         except OSError as error:
             raise CheckpointError(f"{folder}: the checkpoint could not be written: {error}.") from error
-        self._saved_iteration = self.current_learning_iteration
-        return path
+        return self._saved
 
     def load(self, path: Path | str, *, allow_drift: bool = False) -> None:
         """Go on exactly where a checkpoint was written; nothing changes unless all of it fits.
@@ -221,9 +226,9 @@ class EagleRunner(OnPolicyRunner):
                 f"{checkpoint.path}: cannot be resumed bit for bit, these have changed:\n  {listed}\n"
                 "Undo the changes, or go on with --allow-drift, which marks the run."
             )
+        self._load_state(checkpoint)
         drifted = bool(changes) or checkpoint.manifest["drifted"]
         self.provenance = dataclasses.replace(self.provenance, drifted=drifted)
-        self._load_state(checkpoint)
 
     def load_weights(self, path: Path | str) -> None:
         """Start from the policy and critic of a checkpoint; optimiser, counters and environment stay fresh."""
@@ -261,10 +266,12 @@ class EagleRunner(OnPolicyRunner):
         self.env.load_state_dict(local["env"])
         self.alg.load(state["algorithm"])
         self.logger.episodes.load_state_dict(local["episodes"])
-        self.current_learning_iteration = self._saved_iteration = state["runner"]["next_iteration"]
+        self.current_learning_iteration = state["runner"]["next_iteration"]
         self.env_steps = state["runner"]["env_steps"]
         self.wall_time = state["runner"]["wall_time"]
         self._score = checkpoint.manifest["score"]
+        own = self.folder is not None and checkpoint.path.parent.resolve() == (self.folder / "checkpoints").resolve()
+        self._saved = checkpoint.path if own else None
         torch.set_rng_state(local["rng"]["cpu"])
         if "cuda" in local["rng"]:
             torch.cuda.set_rng_state(local["rng"]["cuda"], self.device)
@@ -273,9 +280,8 @@ class EagleRunner(OnPolicyRunner):
         cuda = {"cuda": torch.cuda.get_rng_state(self.device)} if str(self.device).startswith("cuda") else {}
         return {"cpu": torch.get_rng_state()} | cuda
 
-    def _save_now_and_then(self, scalars: dict[str, float]) -> None:
+    def _save_now_and_then(self) -> None:
         """Save every ``save_interval`` iterations; where that fails, training goes on and says so."""
-        self._score = scalars.get("Train/mean_reward")
         if self.current_learning_iteration % self.cfg["save_interval"] == 0:
             try:
                 self.save()

@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from eagle_rl.errors import CheckpointError, ConfigError
-from eagle_rl.runners.checkpoint import verify_checkpoint, write_atomically
+from eagle_rl.runners.checkpoint import verify_checkpoint
+from eagle_rl.runners.files import write_atomically
 from eagle_rl.runners.plan import Stage
 from eagle_rl.runners.provenance import Provenance
 

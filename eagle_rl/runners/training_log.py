@@ -17,7 +17,8 @@ import torch
 from torch import Tensor
 
 from eagle_rl.algorithms.running_means import RunningMeans
-from eagle_rl.runners.checkpoint import write_atomically
+from eagle_rl.runners.event_file import EventFile
+from eagle_rl.runners.files import write_atomically
 
 EPISODES = 100
 """Finished episodes of each robot over which rewards and lengths are averaged."""
@@ -34,8 +35,9 @@ class ThrottledWarning:
 
     def __call__(self, message: str) -> None:
         """Warn unless a warning was given within the last minute."""
-        if self._clock() - self._last >= WARNING_INTERVAL_S:
-            self._last = self._clock()
+        now = self._clock()
+        if now - self._last >= WARNING_INTERVAL_S:
+            self._last = now
             warnings.warn(message, RuntimeWarning, stacklevel=2)
 
 
@@ -64,14 +66,16 @@ class EpisodeStatistics:
         """Means over the last finished episodes, pooled and per robot, by tag."""
         done, reward, length = torch.stack(self._steps, dim=1).cpu()
         self._steps = []
-        for step, env in done.nonzero().tolist():
-            self._finished[self._robot[env]].append((reward[step, env].item(), length[step, env].item()))
+        steps, envs = done.nonzero(as_tuple=True)
+        rows = zip(envs.tolist(), reward[steps, envs].tolist(), length[steps, envs].tolist(), strict=True)
+        for env, total, age in rows:
+            self._finished[self._robot[env]].append((total, age))
         tags: dict[str, float] = {}
         episodes = {f"/{name}": list(f) for name, f in zip(self._names, self._finished, strict=True)}
-        for suffix, rows in (episodes | {"": [e for f in self._finished for e in f]}).items():
-            if rows:
-                tags[f"Train/mean_reward{suffix}"] = fmean(row[0] for row in rows)
-                tags[f"Train/mean_episode_length{suffix}"] = fmean(row[1] for row in rows)
+        for suffix, last in (episodes | {"": [e for f in self._finished for e in f]}).items():
+            if last:
+                tags[f"Train/mean_reward{suffix}"] = fmean(total for total, _ in last)
+                tags[f"Train/mean_episode_length{suffix}"] = fmean(age for _, age in last)
         return tags
 
     def state_dict(self) -> dict[str, Any]:
@@ -96,7 +100,7 @@ class TrainingLog:
         self.episodes = EpisodeStatistics(robot, robot_names)
         self.warn = ThrottledWarning()
         self._extras = RunningMeans()
-        self._writer: Any = None
+        self._events: EventFile | None = None
 
     def add_step(self, rewards: Tensor, dones: Tensor, extras: Mapping[str, Any]) -> None:
         """Take what one environment step returned."""
@@ -113,8 +117,8 @@ class TrainingLog:
             return
         with self._tolerant():
             self.folder.mkdir(parents=True, exist_ok=True)
-            self._truncate_metrics(next_iteration)
-            self._writer = self._open_writer(next_iteration)
+            self._truncate_metrics(self.folder / "metrics.jsonl", next_iteration)
+            self._events = EventFile(self.folder, next_iteration)
 
     def write(self, iteration: int, scalars: Mapping[str, float]) -> None:
         """Append the scalars of one iteration."""
@@ -125,37 +129,22 @@ class TrainingLog:
             with (self.folder / "metrics.jsonl").open("a") as file:
                 file.write(line + "\n")
         with self._tolerant():
-            if self._writer is None:
-                self._writer = self._open_writer(iteration)
-            for tag, value in scalars.items():
-                self._writer.add_scalar(tag, value, iteration)
+            if self._events is None:
+                self._events = EventFile(self.folder, iteration)
+            self._events.write(iteration, scalars)
 
-    def close(self) -> None:
-        """Flush and close the TensorBoard file."""
-        with self._tolerant():
-            if self._writer is not None:
-                self._writer.close()
-        self._writer = None
-
-    def _open_writer(self, next_iteration: int) -> Any:
-        from torch.utils.tensorboard import SummaryWriter
-
-        return SummaryWriter(log_dir=str(self.folder), purge_step=next_iteration, flush_secs=10)
-
-    def _truncate_metrics(self, next_iteration: int) -> None:
-        assert self.folder is not None
-        path = self.folder / "metrics.jsonl"
+    def _truncate_metrics(self, path: Path, next_iteration: int) -> None:
         if path.exists():
             kept = [line for line in path.read_text().splitlines() if 0 <= _iteration(line) < next_iteration]
             write_atomically(path, "".join(line + "\n" for line in kept).encode())
 
     @contextmanager
     def _tolerant(self) -> Iterator[None]:
-        """Turn a failure to log into a warning; TensorBoard's thread hands on errors of any kind."""
+        """Turn a failure to log into a warning."""
         try:
             yield
-        except Exception as error:
-            self._writer = None
+        except OSError as error:
+            self._events = None
             self.warn(f"Logging to {self.folder} fails, training goes on: {error}")
 
 

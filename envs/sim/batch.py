@@ -21,7 +21,9 @@ class RobotBatch:
     kd lives in ``dof_damping`` so that the integrator treats it implicitly; a force limit therefore clips kp * error.
     """
 
-    def __init__(self, spec: RobotSpec, model: mujoco.MjModel, num_envs: int, decimation: int, num_threads: int) -> None:
+    def __init__(
+        self, spec: RobotSpec, model: mujoco.MjModel, num_envs: int, decimation: int, num_threads: int
+    ) -> None:
         """Create the simulations, all in the model's default keyframe.
 
         Args:

@@ -17,7 +17,8 @@ _BLOCKS = {"root_pos": 3, "root_quat": 4, "root_lin_vel_w": 3, "base_ang_vel_b":
 
 def staging_columns(num_sensors: int) -> dict[str, slice]:
     """Columns of the staging array: root, joint position, velocity and torque in slots, then the sensors."""
-    sizes = _BLOCKS | {"joint_pos": NUM_SLOTS, "joint_vel": NUM_SLOTS, "joint_torque": NUM_SLOTS, "sensors": num_sensors}
+    joints = dict.fromkeys(("joint_pos", "joint_vel", "joint_torque"), NUM_SLOTS)
+    sizes = _BLOCKS | joints | {"sensors": num_sensors}
     edges = np.cumsum([0, *sizes.values()]).tolist()
     return {name: slice(edges[i], edges[i + 1]) for i, name in enumerate(sizes)}
 

@@ -1,0 +1,246 @@
+"""The update: what is summed, what is skipped, what the specialists say."""
+
+import copy
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch.distributions import Normal, kl_divergence
+
+from eagle_rl.algorithms import specialists as specialists_module
+from eagle_rl.algorithms.specialists import SpecialistBank
+from eagle_rl.errors import HealthError
+from eagle_rl.models import EagleActor
+from eagle_rl.runners.on_policy import EagleRunner
+from tests.learner.helpers import collect, make_runner, parameters
+
+ONE_STEP = {"num_learning_epochs": 1, "num_mini_batches": 1}
+
+
+def shaken(actor: EagleActor, seed: int, scale: float = 0.1) -> EagleActor:
+    """A copy with other weights."""
+    twin = copy.deepcopy(actor)
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for p in twin.parameters():
+            p.add_(scale * torch.randn(p.shape, generator=generator))
+    twin.distribution.project_std()
+    return twin
+
+
+def with_specialists(runner: EagleRunner, method: str = "eagle") -> list[EagleActor]:
+    bank = [shaken(runner.alg.actor, seed) for seed in range(3)]
+    runner.imitate(bank, method)
+    return bank
+
+
+@torch.no_grad()
+def distances(actor: EagleActor, bank: list[EagleActor], obs: TensorDict) -> list[float]:
+    """L_a and L_e of each robot on given states."""
+    found = []
+    for robot, specialist in enumerate(bank):
+        rows = obs[obs["robot"] == robot]
+        action = (actor(rows) - specialist(rows)).square().sum() / rows["slot_mask"].sum()
+        found += [action.item(), (actor.embedding - specialist.embedding).square().mean().item()]
+    return found
+
+
+def hand_written_loss(runner: EagleRunner, bank: list[EagleActor]) -> torch.Tensor:
+    """Every term of the loss on the whole rollout, row by row over live slots, sharing no code with the learner."""
+    alg, cfg, storage = runner.alg, runner.alg.cfg, runner.alg.storage
+    obs = storage.observations.flatten(0, 1).exclude("teacher_action", "teacher_std", "teacher_embedding")
+    actions, old_log_prob, advantages, returns = (
+        x.flatten(0, 1).clone()
+        for x in (storage.actions, storage.actions_log_prob, storage.advantages, storage.returns)
+    )
+    mean, std = alg.actor(obs), alg.actor.distribution.std_param
+    embedding, estimate = alg.actor.embedding, alg.actor.estimate
+    perm, sign = runner.env.mirror["actions"]
+    flipped = {k: obs[k][:, runner.env.mirror[k][0]] * runner.env.mirror[k][1] for k in ("history", "command", "clock")}
+    mirrored = obs.clone().update(flipped | {"slot_mask": obs["slot_mask"][:, perm]})
+    image = alg.actor(mirrored)[:, perm] * sign
+
+    surrogate, entropy, mirror, action, embed, kick = [], [], [], [], [], []
+    for i in range(len(obs)):
+        live = obs["slot_mask"][i] > 0
+        pi = Normal(mean[i, live], std[live])
+        ratio = torch.exp(pi.log_prob(actions[i, live]).sum() - old_log_prob[i, 0])
+        clipped = ratio.clamp(1 - cfg.clip_param, 1 + cfg.clip_param)
+        surrogate.append(-torch.min(advantages[i, 0] * ratio, advantages[i, 0] * clipped))
+        entropy.append(pi.entropy().sum())
+        mirror.append((mean[i, live].detach() - image[i, live]).square())
+        teacher = bank[int(obs["robot"][i])]
+        with torch.no_grad():
+            teacher_mean = teacher(obs[i : i + 1])[0, live]
+            teacher_std = teacher.distribution.std_param[live]
+        action.append((mean[i, live] - teacher_mean).square())
+        embed.append((embedding[i] - teacher.embedding[0]).square())
+        kick.append(kl_divergence(Normal(teacher_mean, teacher_std), pi).sum())
+    error = (estimate - obs["estimate"]).square()
+    return (
+        torch.stack(surrogate).mean()
+        + cfg.value_loss_coef * (alg.critic(obs) - returns).square().mean()
+        - cfg.entropy_coef * torch.stack(entropy).mean()
+        + cfg.estimation_coef * (error[:, :3].mean() + error[:, 3:].mean())
+        + cfg.mirror_coef * torch.cat(mirror).mean()
+        + cfg.action_loss_coef * torch.cat(action).mean()
+        + cfg.embedding_loss_coef * torch.cat(embed).mean()
+        + cfg.kickstart_coef * math.exp(-cfg.kickstart_decay * alg.num_updates) * torch.stack(kick).mean()
+    )
+
+
+def test_the_gradient_of_update_is_that_of_a_hand_written_sum_of_all_losses():
+    runner = make_runner(
+        **ONE_STEP, mirror_fraction=1.0, max_grad_norm=1e9, learning_rate=0.0, entropy_coef=0.01, action_loss_coef=0.3
+    )
+    bank = with_specialists(runner)
+    with_specialists(runner, "kickstart")
+    runner.alg.num_updates = 50
+    collect(runner)
+    runner.alg.actor.load_state_dict(shaken(runner.alg.actor, 9, 0.03).state_dict())  # so that ratios are not all 1
+    hand_written_loss(runner, bank).backward()
+    named = [(f"{m}.{k}", p) for m in ("actor", "critic") for k, p in getattr(runner.alg, m).named_parameters()]
+    expected = {name: p.grad.clone() for name, p in named}
+    runner.alg.update()
+    for name, p in named:
+        scale = expected[name].abs().max().item()
+        torch.testing.assert_close(
+            p.grad, expected[name], rtol=1e-3, atol=1e-4 * scale, msg=lambda m, n=name: f"{n}: {m}"
+        )
+
+
+def test_time_outs_are_bootstrapped_with_the_value_of_their_true_final_observation():
+    runner = make_runner()
+    alg, env = runner.alg, runner.env
+    obs = env.get_observations()
+    final = obs[:2].clone()
+    final["critic"] = torch.tensor([[5.0], [-3.0]]).expand(2, obs["critic"].shape[1]).clone()
+    extras = {"final_ids": torch.tensor([4, 1]), "final_observations": final, "time_outs": torch.ones(env.num_envs)}
+    with torch.no_grad():
+        alg.act(obs)
+        alg.process_env_step(obs, torch.full((env.num_envs,), 2.0), torch.ones(env.num_envs), extras)
+        values = alg.critic(final)[:, 0]
+    expected = torch.full((env.num_envs,), 2.0)
+    expected[4] += 0.9 * values[0]
+    expected[1] += 0.9 * values[1]
+    torch.testing.assert_close(alg.storage.rewards[0, :, 0], expected)
+    assert abs(values[0] - values[1]) > 1e-3, "the critic cannot tell the two apart, so the test shows nothing"
+
+
+@pytest.mark.parametrize(
+    ("desired_kl", "learning_rate", "expected"),
+    [(1e-9, 1e-3, 1e-3 / 1.5), (1e3, 1e-3, 1.5e-3), (1e-9, 1.2e-5, 1e-5), (1e3, 1.9e-3, 2e-3)],
+)
+def test_the_learning_rate_moves_once_an_iteration_inside_its_range(desired_kl, learning_rate, expected):
+    runner = make_runner(desired_kl=desired_kl, learning_rate=learning_rate)
+    used = []
+    runner.alg.optimizer.register_step_post_hook(lambda opt, *_: used.append(opt.param_groups[0]["lr"]))
+    collect(runner)
+    runner.alg.update()
+    assert used == [learning_rate] * 16
+    assert runner.alg.learning_rate == pytest.approx(expected)
+    assert runner.alg.optimizer.param_groups[0]["lr"] == runner.alg.learning_rate
+
+
+def test_a_policy_that_does_not_move_keeps_its_learning_rate():
+    runner = make_runner(learning_rate=0.0, learning_rate_range=(0.0, 1.0))
+    collect(runner)
+    assert runner.alg.update()["Loss/kl"] == 0.0
+    assert runner.alg.learning_rate == 0.0
+
+
+@pytest.mark.parametrize("poison", [math.nan, math.inf, -math.inf, 1e30])
+def test_a_step_whose_gradient_is_not_finite_is_skipped_and_counted(poison):
+    runner = make_runner(**ONE_STEP)
+    collect(runner)
+    before = parameters(runner)
+    runner.alg.storage.returns[0, 0] = poison
+    scalars = runner.alg.update()
+    assert scalars["Health/skipped_updates"] == 1.0
+    assert all(torch.equal(x, before[key]) for key, x in parameters(runner).items())
+    collect(runner)
+    assert runner.alg.update()["Health/skipped_updates"] == 1.0
+    assert not torch.equal(parameters(runner)["actor.mlp.0.weight"], before["actor.mlp.0.weight"])
+
+
+def test_three_gradients_in_a_row_that_are_not_finite_stop_the_run():
+    runner = make_runner(num_learning_epochs=3, num_mini_batches=1)
+    collect(runner)
+    before = parameters(runner)
+    runner.alg.storage.returns[0, 0] = math.nan
+    with pytest.raises(HealthError, match="3 times in a row"):
+        runner.alg.update()
+    assert all(torch.equal(x, before[key]) for key, x in parameters(runner).items())
+
+
+def test_each_row_is_labelled_by_the_specialist_of_its_robot(monkeypatch):
+    monkeypatch.setattr(specialists_module, "CHUNK_ROWS", 7)  # several chunks, the last one short
+    runner = make_runner()
+    bank = [shaken(runner.alg.actor, seed) for seed in range(3)]
+    collect(runner)
+    labels = SpecialistBank(bank).label(runner.alg.storage.observations)
+    obs = runner.alg.storage.observations
+    for robot, specialist in enumerate(bank):
+        rows = obs["robot"] == robot
+        with torch.no_grad():
+            expected = specialist(obs[rows])
+        torch.testing.assert_close(labels["teacher_action"][rows], expected)
+        torch.testing.assert_close(labels["teacher_embedding"][rows], specialist.embedding)
+        torch.testing.assert_close(
+            labels["teacher_std"][rows], specialist.distribution.std_param * obs["slot_mask"][rows]
+        )
+    assert all(torch.count_nonzero(labels[k] * (1 - obs["slot_mask"])) == 0 for k in ("teacher_action", "teacher_std"))
+
+
+def test_specialists_are_frozen():
+    runner = make_runner()
+    bank = with_specialists(runner)
+    before = [copy.deepcopy(actor.state_dict()) for actor in bank]
+    runner.learn(2)
+    for actor, state in zip(bank, before, strict=True):
+        assert all(torch.equal(x, state[key]) for key, x in actor.state_dict().items())
+
+
+@pytest.mark.parametrize("use_ppo_loss", [True, False])
+def test_distillation_brings_actions_and_embeddings_of_every_robot_to_its_specialist(use_ppo_loss):
+    rates = {"learning_rate": 3e-3, "learning_rate_range": (3e-3, 3e-3)}
+    runner = make_runner(action_loss_coef=20.0, estimation_coef=0.5, use_ppo_loss=use_ppo_loss, **rates)
+    bank = [shaken(runner.alg.actor, 0)] * 3
+    runner.imitate(bank, "eagle")
+    collect(runner)
+    states = runner.alg.storage.observations.flatten(0, 1).clone()
+    before = distances(runner.alg.actor, bank, states)
+    scalars = runner.alg.update()
+    assert {f"Distill/{loss}/{name}" for loss in ("L_a", "L_e") for name in runner.alg.robot_names} <= set(scalars)
+    for _ in range(20):
+        collect(runner)
+        runner.alg.update()
+    after = distances(runner.alg.actor, bank, states)
+    assert all(b < 0.6 * a for a, b in zip(before, after, strict=True)), f"{before} -> {after}"
+
+
+def test_pure_imitation_leaves_the_critic_and_the_exploration_alone():
+    runner = make_runner(use_ppo_loss=False)
+    with_specialists(runner)
+    before = parameters(runner)
+    collect(runner)
+    runner.alg.update()
+    for key, x in parameters(runner).items():
+        still = key.startswith("critic") or key == "actor.distribution.std_param"
+        assert torch.equal(x, before[key]) == still, key
+
+
+def test_kickstarting_fades_with_the_iterations_of_its_stage():
+    runner = make_runner(kickstart_coef=2.0, kickstart_decay=0.1)
+    with_specialists(runner, "kickstart")
+    weight = runner.alg.symmetry.terms[-1].weight
+    assert weight() == 2.0
+    runner.alg.num_updates = 5
+    assert weight() == pytest.approx(2.0 * math.exp(-0.5))
+
+
+def test_losses_with_weight_zero_are_not_computed():
+    runner = make_runner(estimation_coef=0.0, mirror_coef=0.0)
+    collect(runner)
+    assert not {"Loss/estimation", "Loss/mirror"} & set(runner.alg.update())

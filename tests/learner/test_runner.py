@@ -1,0 +1,366 @@
+"""Training runs: they learn, resume bit for bit, stop politely and survive a broken log."""
+
+import json
+import math
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from rich.console import Console
+
+from eagle_rl.config.schema import RunCfg
+from eagle_rl.errors import CheckpointError, HealthError, Interrupted
+from eagle_rl.runners import checkpoint as ckpt
+from eagle_rl.runners.health import require_finite
+from eagle_rl.runners.on_policy import EagleRunner
+from eagle_rl.runners.progress import ProgressReport
+from eagle_rl.runners.provenance import Provenance
+from eagle_rl.runners.training_log import ThrottledWarning
+from tests.learner.helpers import make_runner, parameters
+from tests.learner.test_eagle_ppo import shaken
+from tests.toy import ToyEnv
+
+ROOT = Path(__file__).parents[2]
+
+
+def metrics(folder: Path) -> list[dict]:
+    """Lines of a run's metrics without those that measure time."""
+    rows = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    return [{k: v for k, v in row.items() if not k.startswith("Perf/")} for row in rows]
+
+
+def assert_same(one: EagleRunner, other: EagleRunner) -> None:
+    """Everything that decides the future is equal, bit for bit."""
+    a, b = one._state(), other._state()
+    for state in (a, b):
+        state["runner"].pop("wall_time")
+    compare(a, b, "state")
+
+
+def compare(a, b, where: str) -> None:
+    if isinstance(a, dict):
+        assert a.keys() == b.keys(), where
+        for key in a:
+            compare(a[key], b[key], f"{where}.{key}")
+    elif isinstance(a, (list, tuple)):
+        assert len(a) == len(b), where
+        for i, (x, y) in enumerate(zip(a, b, strict=True)):
+            compare(x, y, f"{where}[{i}]")
+    elif isinstance(a, torch.Tensor):
+        assert torch.equal(a, b), where
+    else:
+        assert a == b, where
+
+
+def test_training_raises_the_reward_of_every_robot(tmp_path):
+    algo = {"gamma": 0.8, "num_steps_per_env": 16, "desired_kl": 0.02, "learning_rate_range": (1e-4, 1e-2)}
+    make_runner(tmp_path, ToyEnv(48), **algo).learn(30)
+    rows = metrics(tmp_path)
+    first, last = rows[4], rows[-1]  # by the fifth iteration the shortened first episodes are few
+    for robot, share in {"/one": 0.7, "/two": 0.7, "/three": 0.9, "": 0.7}.items():
+        begin, end = (r[f"Train/mean_reward{robot}"] / r[f"Train/mean_episode_length{robot}"] for r in (first, last))
+        assert end > share * begin, f"reward per step{robot}: {begin} -> {end}"  # rewards are negative
+    assert last["Loss/estimation"] < 0.5 * first["Loss/estimation"]
+
+
+def test_scalars_carry_the_field_s_tags(tmp_path):
+    make_runner(tmp_path).learn(2)
+    row = json.loads((tmp_path / "metrics.jsonl").read_text().splitlines()[-1])
+    wanted = """Train/mean_reward Train/mean_episode_length Train/mean_reward/one Perf/total_fps Perf/collection_time
+        Perf/learning_time Loss/value Loss/surrogate Loss/entropy Loss/estimation Loss/mirror Loss/learning_rate
+        Policy/mean_std Metrics/error/one Health/skipped_updates iteration"""
+    assert set(wanted.split()) <= set(row)
+    assert row["iteration"] == 2
+    assert row["Perf/env_steps"] == 2 * 8 * 24
+    assert list(tmp_path.glob("events.out.tfevents.*"))
+
+
+def test_logged_rewards_and_lengths_are_those_of_finished_episodes():
+    runner = make_runner()
+    episodes = runner.logger.episodes
+    n = runner.env.num_envs
+    for step in range(3):
+        dones = torch.zeros(n, dtype=torch.bool)
+        dones[0] = step == 1  # robot one: two steps of 1.0
+        dones[4] = step == 2  # robot two: three steps of 1.0
+        episodes.add(torch.ones(n), dones)
+    tags = episodes.collect()
+    assert tags["Train/mean_reward/one"] == tags["Train/mean_episode_length/one"] == 2.0
+    assert tags["Train/mean_reward/two"] == 3.0
+    assert tags["Train/mean_reward"] == 2.5
+    assert "Train/mean_reward/three" not in tags
+
+
+def test_a_resumed_run_equals_the_uninterrupted_one_bit_for_bit(tmp_path):
+    whole = make_runner(tmp_path / "whole")
+    whole.learn(5)
+    cut = make_runner(tmp_path / "cut")
+    path = cut.learn(3)  # 24 steps: in the middle of episodes of 16
+    torch.manual_seed(12345)
+    resumed = make_runner(tmp_path / "cut")
+    resumed.load(path)
+    resumed.learn(2)
+    assert_same(whole, resumed)
+    assert metrics(tmp_path / "cut") == metrics(tmp_path / "whole")
+
+
+def test_a_resumed_distillation_equals_the_uninterrupted_one(tmp_path):
+    def runner(name: str) -> EagleRunner:
+        r = make_runner(tmp_path / name)
+        actor = make_runner(seed=5).alg.actor
+        torch.manual_seed(1)
+        r.imitate([shaken(actor, seed) for seed in range(3)], "kickstart")
+        return r
+
+    whole, cut = runner("whole"), runner("cut")
+    whole.learn(4)
+    torch.manual_seed(1)
+    cut.learn(2)
+    resumed = runner("cut")
+    resumed.load(ckpt.latest_checkpoint(tmp_path / "cut" / "checkpoints"))
+    resumed.learn(2)
+    compare(parameters(whole), parameters(resumed), "parameters")
+    assert resumed.alg.num_updates == 4
+
+
+def test_lines_beyond_the_checkpoint_and_torn_ones_are_dropped_on_resume(tmp_path):
+    path = make_runner(tmp_path).learn(2)
+    with (tmp_path / "metrics.jsonl").open("a") as file:
+        file.write('{"iteration": 3, "Loss/value": 1.0}\n{"iteration": 4, "Lo')
+    resumed = make_runner(tmp_path)
+    resumed.load(path)
+    resumed.learn(1)
+    assert [row["iteration"] for row in metrics(tmp_path)] == [1, 2, 3]
+
+
+def test_a_changed_configuration_or_robot_is_refused_unless_drift_is_allowed(tmp_path):
+    before = Provenance(config={"algo": {"gamma": 0.9}}, robots={"one": "aa", "two": "bb"})
+    after = Provenance(config={"algo": {"gamma": 0.8}}, robots={"one": "aa", "two": "cc"})
+    path = make_runner(tmp_path, provenance=before).learn(1)
+    runner = make_runner(tmp_path, provenance=after)
+    untouched = parameters(runner)
+    with pytest.raises(CheckpointError, match=r"(?s)config\.algo\.gamma: 0\.9 -> 0\.8.*robot_hashes\.two: bb -> cc"):
+        runner.load(path)
+    compare(untouched, parameters(runner), "parameters after a refusal")
+    runner.load(path, allow_drift=True)
+    final = runner.learn(1)
+    assert ckpt.read_manifest(final)["drifted"]
+    assert not ckpt.read_manifest(path)["drifted"]
+
+
+def test_weights_of_another_shape_are_refused_before_any_is_changed(tmp_path):
+    path = make_runner(tmp_path).learn(1)
+    data = ckpt.load_checkpoint(path)
+    state = data.state
+    state["algorithm"]["critic_state_dict"]["mlp.0.weight"] = torch.zeros(3, 3)
+    bad = ckpt.save_checkpoint(tmp_path / "bad", state, Provenance(), iteration=1, env_steps=0)
+    runner = make_runner()
+    before = parameters(runner)
+    for load in (runner.load, runner.load_weights):
+        with pytest.raises(CheckpointError, match=r"critic has other shapes.*\s+mlp\.0\.weight: \(3, 3\), expected"):
+            load(bad)
+    compare(before, parameters(runner), "parameters after a refusal")
+
+
+def test_a_stage_starts_from_the_weights_of_another_with_fresh_counters(tmp_path):
+    root = make_runner(tmp_path)
+    path = root.learn(2)
+    stage = make_runner(env=ToyEnv(8, ("two",)), seed=9)
+    stage.load_weights(path)
+    compare(parameters(root), parameters(stage), "weights")
+    assert stage.current_learning_iteration == stage.env_steps == stage.alg.num_updates == 0
+    assert not stage.alg.optimizer.state
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_run_finishes_its_iteration_saves_and_goes_on_unchanged(tmp_path, number):
+    whole = make_runner()
+    whole.learn(4)
+    runner = make_runner(tmp_path)
+    with pytest.raises(Interrupted, match="after iteration 2") as caught:
+        runner.learn(4, on_iteration=lambda i: signal.raise_signal(number) if i == 2 else None)
+    assert caught.value.exit_code == 130
+    resumed = make_runner(tmp_path)
+    resumed.load(ckpt.latest_checkpoint(tmp_path / "checkpoints"))
+    assert resumed.current_learning_iteration == 2
+    resumed.learn(2)
+    assert_same(whole, resumed)
+
+
+def test_a_second_signal_leaves_at_once_with_the_last_checkpoint_intact(tmp_path):
+    def twice(iteration: int) -> None:
+        if iteration == 3:
+            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
+
+    handler = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt) as caught:
+        make_runner(tmp_path, run=RunCfg(save_interval=2)).learn(5, on_iteration=twice)
+    assert caught.type is KeyboardInterrupt
+    assert ckpt.latest_checkpoint(tmp_path / "checkpoints").name == "model_2.pt"
+    assert signal.getsignal(signal.SIGINT) is handler
+
+
+def test_a_vanished_log_folder_is_reported_once_and_training_goes_on(tmp_path):
+    folder = tmp_path / "run"
+    runner = make_runner(folder)
+    with pytest.warns(RuntimeWarning, match="training goes on") as caught:
+        path = runner.learn(4, on_iteration=lambda i: shutil.rmtree(folder) if i == 1 else None)
+    assert len(caught) == 1
+    assert runner.current_learning_iteration == 4
+    ckpt.verify_checkpoint(path)
+
+
+def test_a_full_disk_keeps_the_last_good_checkpoint_and_training_goes_on(tmp_path, monkeypatch):
+    def fill_disk(iteration: int) -> None:
+        if iteration == 2:
+            monkeypatch.setattr(ckpt, "write_atomically", full)
+
+    def full(path, data):
+        raise OSError(28, "No space left on device")
+
+    runner = make_runner(tmp_path, run=RunCfg(save_interval=1))
+    with (
+        pytest.warns(RuntimeWarning, match=r"No space left.*Training goes on"),
+        pytest.raises(CheckpointError, match="could not be written"),
+    ):
+        runner.learn(4, on_iteration=fill_disk)
+    assert runner.current_learning_iteration == 4
+    assert ckpt.latest_checkpoint(tmp_path / "checkpoints").name == "model_2.pt"
+
+
+def test_warnings_are_repeated_once_a_minute_at_most():
+    times = iter(range(0, 150, 10))
+    warn = ThrottledWarning(lambda: next(times))
+    with pytest.warns(RuntimeWarning, match="full") as caught:
+        [warn("full") for _ in range(15)]
+    assert len(caught) == 3
+
+
+@pytest.mark.parametrize("poison", [math.nan, math.inf, -math.inf])
+def test_what_is_not_finite_is_named_with_its_robot_and_environments(poison):
+    robot = torch.tensor([0, 0, 1, 1])
+    tensors = {"history": torch.zeros(4, 7), "rewards": torch.zeros(4)}
+    require_finite(tensors, robot, ["h1", "g1"])
+    tensors["history"][2:, 5] = poison
+    expected = rf"history is not finite: {poison} in column 5; robots g1; environments \[2, 3\]"
+    with pytest.raises(HealthError, match=expected):
+        require_finite(tensors, robot, ["h1", "g1"])
+
+
+@pytest.mark.parametrize("where", ["rewards", "critic"])
+def test_an_unsound_environment_stops_the_run_with_a_checkpoint(tmp_path, where):
+    class Sick(ToyEnv):
+        steps = 0
+
+        def step(self, actions):
+            obs, rewards, dones, extras = super().step(actions)
+            self.steps += 1
+            if self.steps == 12:
+                (rewards if where == "rewards" else obs[where])[4] = math.inf
+            return obs, rewards, dones, extras
+
+    runner = make_runner(tmp_path, Sick())
+    with pytest.raises(HealthError, match=rf"{where} is not finite: inf in column 0; robots two; environments \[4\]"):
+        runner.learn(3)
+    assert ckpt.latest_checkpoint(tmp_path / "checkpoints").name == "model_1.pt"
+
+
+def test_parameters_that_are_not_finite_are_never_saved(tmp_path):
+    runner = make_runner(tmp_path)
+    with torch.no_grad():
+        runner.alg.critic.mlp[0].bias[0] = math.nan
+    with pytest.raises(HealthError, match=r"mlp\.0\.bias is not finite"):
+        runner.save()
+    assert not (tmp_path / "checkpoints").exists()
+
+
+def test_first_episodes_are_staggered_unless_the_run_is_resumed(tmp_path):
+    ages = []
+
+    class Watched(ToyEnv):
+        def step(self, actions):
+            ages.append(self.episode_length_buf.clone())
+            return super().step(actions)
+
+    path = make_runner(tmp_path, Watched()).learn(1)
+    assert ages[0].unique().numel() > 5
+    resumed = make_runner(tmp_path, Watched())
+    resumed.load(path)
+    expected = resumed.env.episode_length_buf.clone()
+    ages.clear()
+    resumed.learn(1)
+    assert torch.equal(ages[0], expected)
+
+
+def test_progress_is_one_line_with_the_time_left(capsys):
+    console = Console(force_terminal=False, width=200)
+    scalars = {"Perf/total_fps": 3000.0, "Train/mean_reward": 1.5, "Train/mean_episode_length": 900.0}
+    with ProgressReport("round1/distill", 0, 2, console) as progress:
+        progress.update(1, 7680, scalars)  # too soon after the start for a line
+        progress.update(2, 15360, scalars)
+    out = capsys.readouterr().out
+    assert out == "round1/distill 2/2 | 0.02M steps | 3000/s | reward 1.50 | length 900 | 0.0 min left\n"
+
+
+def test_progress_draws_a_bar_on_a_terminal(capsys):
+    console = Console(force_terminal=True, width=200)
+    with ProgressReport("ppo", 0, 1, console) as progress:
+        progress.update(1, 1, {"Perf/total_fps": 1.0})
+    assert "ppo 1/1" in capsys.readouterr().out
+
+
+PROCESS = """
+import sys, torch
+from pathlib import Path
+from tests.learner.helpers import make_runner, parameters
+from tests.toy import ToyEnv
+rank = int(sys.argv[2])
+runner = make_runner(Path(sys.argv[1]), ToyEnv(12, seed=rank))
+runner.learn(2)
+torch.save(parameters(runner), f"{sys.argv[1]}/rank{rank}.pt")
+"""
+
+
+def test_two_processes_train_one_policy(tmp_path):
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = str(probe.getsockname()[1])
+    env = os.environ | {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "OMP_NUM_THREADS": "1"}
+    ranks = [
+        subprocess.Popen(
+            [sys.executable, "-c", PROCESS, str(tmp_path), str(rank)],
+            cwd=ROOT,
+            env=env | {"RANK": str(rank), "LOCAL_RANK": str(rank)},
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for rank in range(2)
+    ]
+    errors = [process.communicate(timeout=120)[1] for process in ranks]
+    assert [process.returncode for process in ranks] == [0, 0], errors
+    one, other = (torch.load(tmp_path / f"rank{rank}.pt", weights_only=True) for rank in range(2))
+    compare(one, other, "parameters")
+    state = ckpt.load_checkpoint(ckpt.latest_checkpoint(tmp_path / "checkpoints")).state
+    assert len(state["processes"]) == 2
+    assert state["runner"]["env_steps"] == 2 * 2 * 8 * 12
+    frames = [process["env"]["frames"] for process in state["processes"]]
+    assert not torch.equal(*frames), "both processes simulated the same"
+
+
+def test_a_stage_that_was_interrupted_after_its_last_iteration_ends_without_new_data(tmp_path):
+    with pytest.raises(Interrupted, match=r"saved as .*model_1\.pt"):
+        make_runner(tmp_path).learn(1, on_iteration=lambda i: signal.raise_signal(signal.SIGINT))
+    path = ckpt.latest_checkpoint(tmp_path / "checkpoints")
+    before = path.read_bytes()
+    resumed = make_runner(tmp_path)
+    resumed.load(path)
+    assert resumed.learn(0) == path
+    assert path.read_bytes() == before
+    assert ckpt.verify_checkpoint(path)["stage_end"]
