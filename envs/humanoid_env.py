@@ -198,9 +198,9 @@ class HumanoidEnv(VecEnv):
 
     def pin_commands(self, command: Tensor | None) -> None:
         """Hold these commands, shape (N, 5), instead of sampling; ``None`` returns to sampling at the next draw."""
-        self._pinned = command
-        if command is not None:
-            self._set_commands(self._all, command.to(self.command))
+        self._pinned = None if command is None else command.to(self.command)
+        if self._pinned is not None:
+            self._set_commands(self._all, self._pinned)
             self._show_commands()
 
     @property
@@ -346,7 +346,7 @@ class HumanoidEnv(VecEnv):
 
     def _draw_commands(self, ids: Tensor) -> None:
         if self._pinned is not None:
-            self._set_commands(ids, self._pinned[ids].to(self.command))
+            self._set_commands(ids, self._pinned[ids])
             return
         command, _ = self.commands.sample(ids, self.command_count[ids])
         self.command_count[ids] += 1
