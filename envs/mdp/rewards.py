@@ -101,7 +101,8 @@ def contact_force(state: PooledState, robots: PooledRobots, ctx: RewardContext) 
 
     The norm is over all three components, else a vertically loaded swing foot goes unpunished (HugWBC 11.2).
     """
-    kappa = ctx.cfg.contact_force_kappa + SHAPING_KAPPA * ctx.gait_shaping * (robots.total_mass / REFERENCE_MASS).square()
+    weight = robots.total_mass / REFERENCE_MASS
+    kappa = ctx.cfg.contact_force_kappa + SHAPING_KAPPA * ctx.gait_shaping * weight.square()
     loaded = 1.0 - _rho(_square_sum(state.foot_force_w), kappa.unsqueeze(1))
     return _dot(1.0 - ctx.contact_probability(state), loaded)
 
