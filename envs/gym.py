@@ -36,7 +36,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 from tensordict import TensorDict
 
-from eagle_rl.config.schema import ObservationsCfg, TaskCfg
+from eagle_rl.config.schema import AidsCfg, ObservationsCfg, TaskCfg
 from eagle_rl.errors import ConfigError
 
 from .humanoid_env import HumanoidEnv
@@ -46,7 +46,10 @@ from .rendering.scene import Stage
 from .robots.load import load_robot
 from .robots.slots import NUM_SLOTS
 
+OBSERVATION_GROUPS = ("history", "command", "clock", "slot_mask")
 ENV_ID = "eagle/Humanoid-v0"
+DEFAULT_TASK = TaskCfg(aids=AidsCfg(harness=0.0, gait_shaping=0.0))
+"""The task without learning aids, which would change with training."""
 ACTION_UNIT = 4.0
 """Task action at the bound of the action space [-]: about 1 rad of PD target."""
 
@@ -62,14 +65,9 @@ def observation_space(cfg: ObservationsCfg) -> spaces.Dict:
     def box(group: str, bound: float) -> spaces.Box:
         return spaces.Box(-bound, bound, (layout.size(group),), np.float32)
 
-    return spaces.Dict(
-        {
-            "history": box("history", cfg.clip),
-            "command": box("command", cfg.clip),
-            "clock": box("clock", 1.0),
-            "slot_mask": spaces.Box(0.0, 1.0, (NUM_SLOTS,), np.float32),
-        }
-    )
+    mask = spaces.Box(0.0, 1.0, (NUM_SLOTS,), np.float32)
+    boxes = (box("history", cfg.clip), box("command", cfg.clip), box("clock", 1.0), mask)
+    return spaces.Dict(dict(zip(OBSERVATION_GROUPS, boxes, strict=True)))
 
 
 def action_space() -> spaces.Box:
@@ -77,9 +75,9 @@ def action_space() -> spaces.Box:
     return spaces.Box(-1.0, 1.0, (NUM_SLOTS,), np.float32)
 
 
-def _observation(groups: TensorDict, space: spaces.Dict) -> Observation:
+def _observation(groups: TensorDict) -> Observation:
     """Copies, which stay as they are when the environment moves on."""
-    return {name: groups[name].numpy().copy() for name in space}
+    return {name: groups[name].numpy().copy() for name in OBSERVATION_GROUPS}
 
 
 class _Simulation:
@@ -87,7 +85,7 @@ class _Simulation:
 
     def __init__(self, robots: Sequence[str], task: TaskCfg | None, num_envs: int, num_threads: int) -> None:
         self.specs = [load_robot(name) for name in robots]
-        self.task = task or TaskCfg()
+        self.task = task or DEFAULT_TASK
         self.num_envs, self.num_threads = num_envs, num_threads
         self._env: HumanoidEnv | None = None
 
@@ -119,7 +117,7 @@ class _Simulation:
         return groups, rewards.numpy(), (dones & ~truncations).numpy(), truncations.numpy(), extras
 
 
-class HumanoidGymEnv(gymnasium.Env[Observation, Array]):
+class HumanoidGymEnv(gymnasium.Env[Any, Any]):
     """One robot."""
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": _FPS}  # noqa: RUF012 (gymnasium's own shape)
@@ -131,7 +129,7 @@ class HumanoidGymEnv(gymnasium.Env[Observation, Array]):
 
         Args:
             robots: one robot, by name or by the path of its YAML file.
-            task: the Markov decision process.
+            task: the Markov decision process, :data:`DEFAULT_TASK` unless given.
             render_mode: ``rgb_array`` or None.
         """
         if len(robots) != 1 or isinstance(robots, str):
@@ -172,10 +170,10 @@ class HumanoidGymEnv(gymnasium.Env[Observation, Array]):
             self._renderer = None
 
     def _row(self, groups: TensorDict) -> tuple[Observation, dict[str, Any]]:
-        return _observation(groups[0], self.observation_space), {"critic": groups["critic"][0].numpy().copy()}
+        return _observation(groups[0]), {"critic": groups["critic"][0].numpy().copy()}
 
 
-class HumanoidVectorEnv(gymnasium.vector.VectorEnv[dict[str, Array], Array, NDArray[Any]]):
+class HumanoidVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
     """Several robots in one pool, ``num_envs`` shared equally among them; resets in the same step."""
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}  # noqa: RUF012 (gymnasium's own shape)
@@ -192,7 +190,7 @@ class HumanoidVectorEnv(gymnasium.vector.VectorEnv[dict[str, Array], Array, NDAr
         Args:
             num_envs: environments over all robots, N.
             robots: robots by name or by the path of a YAML file.
-            task: the Markov decision process.
+            task: the Markov decision process, :data:`DEFAULT_TASK` unless given.
             num_threads: physics threads, 0 for one per core.
         """
         self.num_envs = num_envs
@@ -204,21 +202,19 @@ class HumanoidVectorEnv(gymnasium.vector.VectorEnv[dict[str, Array], Array, NDAr
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, Array], dict[str, Any]]:
+    ) -> tuple[Observation, dict[str, Any]]:
         """Start new episodes everywhere."""
         super().reset(seed=seed)
         groups = self._sim.reset(seed, self.np_random)
-        return _observation(groups, self.single_observation_space), self._info(groups)
+        return _observation(groups), self._info(groups)
 
-    def step(
-        self, actions: Array
-    ) -> tuple[dict[str, Array], NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
+    def step(self, actions: Array) -> tuple[Observation, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
         """Advance 0.02 s; ``info["final_obs"]`` holds the true last observations of episodes that ended."""
         groups, rewards, terminations, truncations, extras = self._sim.step(actions)
         info = self._info(groups)
         if len(extras["final_ids"]):
             info |= self._final(extras["final_observations"], extras["final_ids"].numpy())
-        return _observation(groups, self.single_observation_space), rewards, terminations, truncations, info
+        return _observation(groups), rewards, terminations, truncations, info
 
     def _info(self, groups: TensorDict) -> dict[str, Any]:
         return {"critic": groups["critic"].numpy().copy(), "_critic": np.ones(self.num_envs, dtype=bool)}
@@ -229,7 +225,7 @@ class HumanoidVectorEnv(gymnasium.vector.VectorEnv[dict[str, Array], Array, NDAr
         mask[ids] = True
         observations = np.full(self.num_envs, None, dtype=object)
         for row, env in enumerate(ids):
-            observations[env] = _observation(groups[row], self.single_observation_space)
+            observations[env] = _observation(groups[row])
         critic = np.zeros((self.num_envs, groups["critic"].shape[1]), np.float32)
         critic[ids] = groups["critic"].numpy()
         return {
@@ -240,6 +236,4 @@ class HumanoidVectorEnv(gymnasium.vector.VectorEnv[dict[str, Array], Array, NDAr
         }
 
 
-gymnasium.register(
-    ENV_ID, entry_point=f"{__name__}:HumanoidGymEnv", vector_entry_point=f"{__name__}:HumanoidVectorEnv"
-)
+gymnasium.register(ENV_ID, entry_point=f"{__name__}:HumanoidGymEnv", vector_entry_point=f"{__name__}:HumanoidVectorEnv")

@@ -38,12 +38,16 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--robots", metavar="A,B|all", help="robots to show [those it was trained on]")
     parser.add_argument(
-        "--viewer", choices=("native", "none"), help="native opens a window [if there is a display and no file is asked for]"
+        "--viewer",
+        choices=("native", "none"),
+        help="native opens a window [if there is a display and no file is asked for]",
     )
     parser.add_argument("--video", type=Path, metavar="FILE.mp4", help="write a video")
     parser.add_argument("--contact-sheet", type=Path, metavar="FILE.png", help="write twelve frames as one picture")
     parser.add_argument(
-        "--commands", metavar="SCRIPT", help=f"command script, a YAML file or one of {', '.join(known_names('commands'))}"
+        "--commands",
+        metavar="SCRIPT",
+        help=f"command script, a YAML file or one of {', '.join(known_names('commands'))}",
     )
     parser.add_argument("--seconds", type=float, metavar="S", help="stop after so long [the script's end]")
     return parser
@@ -103,6 +107,11 @@ def main(argv: Sequence[str]) -> int:
     script = load_commands(args.commands or "demo")
 
     from eagle_rl.runners.locate import find_checkpoint
+    from envs.rendering.recorder import check_writable
+
+    for path, suffix in ((args.video, ".mp4"), (args.contact_sheet, ".png")):
+        if path is not None:
+            check_writable(path, suffix)
 
     checkpoint = find_checkpoint(args.checkpoint or newest_run())
     if viewer == "native":
@@ -123,11 +132,9 @@ def film(session: Session, script: CommandScript, seconds: float, video: Path | 
     from rich.progress import track
 
     from envs.rendering.offscreen import OffscreenRenderer
-    from envs.rendering.recorder import captioned, check_writable, contact_sheet, evenly, save_picture, video_writer
+    from envs.rendering.recorder import captioned, contact_sheet, evenly, save_picture, video_writer
     from envs.rendering.scene import Stage
 
-    if sheet is not None:
-        check_writable(sheet, ".png")
     num_steps = max(1, round(seconds / session.step_dt))
     picks = set(evenly(num_steps, SHEET_FRAMES)) if sheet is not None else set()
     picked = []
@@ -156,7 +163,8 @@ def film(session: Session, script: CommandScript, seconds: float, video: Path | 
 def caption(time: float, command: NDArray[np.float64]) -> str:
     """Time and command in words."""
     vx, vy, wz, h, p = command
-    return f"{time:5.1f} s    forward {vx:+.2f} m/s   left {vy:+.2f} m/s   turn {wz:+.2f} rad/s   height {h:+.2f} m   pitch {p:+.2f} rad"
+    walk = f"forward {vx:+.2f} m/s   left {vy:+.2f} m/s   turn {wz:+.2f} rad/s"
+    return f"{time:5.1f} s    {walk}   height {h:+.2f} m   pitch {p:+.2f} rad"
 
 
 def _report(session: Session, files: Sequence[Path]) -> None:

@@ -80,7 +80,7 @@ def simulate(policy: OnnxPolicy, robot: str, script: CommandScript, substeps: in
     mujoco.mj_forward(model, data)
     policy.reset()
     num_steps = round(script.duration / policy.contract.step_dt)
-    errors = []
+    errors: list[NDArray[np.float64]] = []
     for step in range(num_steps):
         command = script.at(step * policy.contract.step_dt)
         data.ctrl[:] = policy.step(read(data), command)

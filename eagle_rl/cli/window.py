@@ -22,7 +22,7 @@ class Key(NamedTuple):
     """What a key does to the command."""
 
     name: str
-    index: int
+    column: int
     step: float
 
 
@@ -57,15 +57,15 @@ class Keyboard:
         if code == STOP:
             self.command = np.zeros_like(self.command)
         elif code in KEYS:
-            _, index, step = KEYS[code]
+            _, column, step = KEYS[code]
             command = self.command.copy()
-            command[index] = np.clip(round(command[index] + step, 3), self.low[index], self.high[index])
+            command[column] = np.clip(round(command[column] + step, 3), self.low[column], self.high[column])
             self.command = command
 
 
 def help_text() -> str:
     """The keys in words."""
-    keys = ", ".join(f"{key.name} {COMMAND_KEYS[key.index]}{key.step:+g}" for key in KEYS.values())
+    keys = ", ".join(f"{key.name} {COMMAND_KEYS[key.column]}{key.step:+g}" for key in KEYS.values())
     return f"{keys}, Enter stands still"
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,7 +108,8 @@ def _faults_of_times(times: Array, nodes: list[Node]) -> list[str]:
     if times[0] != 0 and not math.isnan(times[0]):
         faults.append(f"{nodes[0].where}: t: got {times[0]:g}, expected 0 in the first entry.")
     faults += [
-        f"{nodes[i].where}: t: got {times[i]:g}, expected at least {BLEND_S:g} s after the entry before ({times[i - 1]:g})."
+        f"{nodes[i].where}: t: got {times[i]:g}, expected at least {times[i - 1] + BLEND_S:g}, "
+        f"{BLEND_S:g} s after the entry before."
         for i in range(1, len(times))
         if times[i] - times[i - 1] < BLEND_S - 1e-9
     ]

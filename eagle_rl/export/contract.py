@@ -4,9 +4,9 @@ Canonical angles are ``sign * (q - zero_offset)``; slot arrays hold zero where a
 
 1. Frame: the terms of ``frame`` side by side, times their scales, bounded by ``observation_clip``.
 2. ``history``: the last ``history_length`` frames, newest first; filled with the first frame at the start.
-3. ``command``: (v_x, v_y, omega, height offset, pitch) times its scale. ``clock``: sin(2 pi phase) of the left and the
-   right foot; the right foot's phase starts at 0 and gains ``gait_frequency * step_dt`` a step, the left one is ahead by
-   ``gait_phase_offset``; both are ``standing_phase`` while the three velocity commands are zero.
+3. ``command``: (v_x, v_y, omega, height offset, pitch) times its scale. ``clock``: sin(2 pi phase) of the left and
+   the right foot; the right foot's phase starts at 0 and gains ``gait_frequency * step_dt`` a step, the left one is
+   ahead by ``gait_phase_offset``; both are ``standing_phase`` while the three velocity commands are zero.
 4. ``slot_mask``: 1 in the robot's slots.
 5. PD targets: default angle + ``action_scale`` * action, both canonical; actions bounded by ``action_clip``.
 """
@@ -113,9 +113,9 @@ class Contract:
             frame = tuple(Term(**_tuples(term)) for term in values.pop("frame"))
             command = Term(**_tuples(values.pop("command")))
             return cls(robots=robots, frame=frame, command=command, **_tuples(values))
+        except CheckpointError:
+            raise
         except (ValueError, KeyError, TypeError, AttributeError) as error:
-            if isinstance(error, CheckpointError):
-                raise
             raise CheckpointError(f"{source}: its contract is damaged ({error}). Export the policy again.") from error
 
 

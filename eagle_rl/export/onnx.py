@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import io
 import logging
 import warnings
@@ -16,7 +17,7 @@ from torch import Tensor
 from eagle_rl.errors import CheckpointError
 from eagle_rl.models import EagleActor
 from eagle_rl.models.actor import ExportedActor
-from eagle_rl.runners.checkpoint import write_atomically
+from eagle_rl.runners.files import write_atomically
 
 from .contract import DIGEST_KEY, METADATA_KEY, Contract
 
@@ -34,14 +35,16 @@ def export_onnx(actor: EagleActor, contract: Contract, path: Path) -> float:
     Raises:
         CheckpointError: ONNX computes something else; nothing is written.
     """
-    module = actor.as_onnx().eval()
+    module = ExportedActor(copy.deepcopy(actor)).eval()
     model = onnx.load_from_string(_to_onnx(module))
     model.metadata_props.add(key=METADATA_KEY, value=contract.to_json())
     model.metadata_props.add(key=DIGEST_KEY, value=contract.digest)
     data = model.SerializeToString()
     difference = compare(module, data)
     if not difference <= TOLERANCE:
-        raise CheckpointError(f"{path}: ONNX and torch differ by {difference:.2g}, allowed {TOLERANCE:.0e}; not written.")
+        raise CheckpointError(
+            f"{path}: ONNX and torch differ by {difference:.2g}, allowed {TOLERANCE:.0e}; not written."
+        )
     write_atomically(path, data)
     return difference
 

@@ -74,7 +74,9 @@ class OnnxPolicy:
         self._session, self.contract = load_session(path)
         known = self.contract.robots
         if robot not in known:
-            raise RobotError(f"{path}: no robot {robot!r} in it.{did_you_mean(robot, known)} It has: {', '.join(known)}.")
+            raise RobotError(
+                f"{path}: no robot {robot!r} in it.{did_you_mean(robot, known)} It has: {', '.join(known)}."
+            )
         self.robot = known[robot]
         self._slots = np.array(self.robot.slots)
         self._mask = np.zeros(len(self.contract.slots))

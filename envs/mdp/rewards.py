@@ -20,6 +20,7 @@ from eagle_rl.config.schema import GaitCfg, RewardsCfg, RewardWeightsCfg
 from ..robots.slots import HIP_DEVIATION_SLOTS, UPPER_SLOTS
 from ..state import PooledRobots, PooledState
 from . import gait
+from .layout import REFERENCE_MASS
 
 SHAPING_KAPPA = 1e4
 """Widening of the contact-force kernel at full gait shaping for a robot of 33 kg [N^2], growing with the square of the
@@ -114,7 +115,9 @@ def contact_force(state: PooledState, robots: PooledRobots, ctx: RewardContext) 
 
     The norm is over all three components, else a vertically loaded swing foot goes unpunished (HugWBC 11.2).
     """
-    kappa = ctx.cfg.contact_force_kappa + SHAPING_KAPPA * ctx.gait_shaping * (robots.total_mass / 33.0).square()
+    kappa = (
+        ctx.cfg.contact_force_kappa + SHAPING_KAPPA * ctx.gait_shaping * (robots.total_mass / REFERENCE_MASS).square()
+    )
     return _swing_load(state, robots, ctx, kappa.unsqueeze(1))
 
 

@@ -8,11 +8,10 @@ from collections.abc import Sequence
 from types import TracebackType
 from typing import Protocol
 
-from typing_extensions import Self
-
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import Self
 
 from eagle_rl.errors import EagleError
 
@@ -56,16 +55,23 @@ def open_context(width: int, height: int) -> _Context:
     Raises:
         RenderingError: no backend works; the message says what to install.
     """
-    for backend in gl_backends():
-        try:
-            if backend == "egl":
-                from mujoco.egl import GLContext
-            else:
-                from mujoco.osmesa import GLContext
-            return GLContext(width, height)
-        except (ImportError, AttributeError, RuntimeError, OSError):
-            continue
-    raise RenderingError(_HELP)
+    contexts = (_open_backend(backend, width, height) for backend in gl_backends())
+    context = next((found for found in contexts if found is not None), None)
+    if context is None:
+        raise RenderingError(_HELP)
+    return context
+
+
+def _open_backend(backend: str, width: int, height: int) -> _Context | None:
+    """A context of one backend, or None if its driver does not work."""
+    try:
+        if backend == "egl":
+            from mujoco.egl import GLContext
+        else:
+            from mujoco.osmesa import GLContext
+        return GLContext(width, height)
+    except (ImportError, AttributeError, RuntimeError, OSError):
+        return None
 
 
 class OffscreenRenderer:

@@ -42,7 +42,14 @@ def video_writer(path: Path, width: int, height: int, fps: float) -> Iterator[Wr
     check_writable(path, ".mp4")
     part = path.with_name(f".{path.stem}.part.mp4")
     rate = Fraction(fps).limit_denominator(1000)
-    encoder = imageio_ffmpeg.write_frames(str(part), (width, height), fps=float(rate), quality=7, macro_block_size=2, output_params=["-preset", "veryfast"])
+    encoder = imageio_ffmpeg.write_frames(
+        str(part),
+        (width, height),
+        fps=float(rate),
+        quality=7,
+        macro_block_size=2,
+        output_params=["-preset", "veryfast"],
+    )
     encoder.send(None)
     try:
         yield lambda frame: encoder.send(np.ascontiguousarray(frame))

@@ -114,8 +114,8 @@ def default_qpos(spec: RobotSpec) -> Array:
 
 
 def lanes(num_robots: int) -> Array:
-    """Lateral position of each robot's lane [m], centred on zero, the first robot leftmost in the picture, shape (num_robots,)."""
-    return LANE_WIDTH * (np.arange(num_robots) - 0.5 * (num_robots - 1))
+    """Lateral position of each robot's lane [m], the first robot leftmost in the picture, shape (num_robots,)."""
+    return LANE_WIDTH * (np.arange(num_robots, dtype=np.float64) - 0.5 * (num_robots - 1))
 
 
 def _distance(num_robots: int, aspect: float, fovy_deg: float) -> float:
@@ -176,6 +176,5 @@ def _add_floor(spec: mujoco.MjSpec) -> None:
     textures = list(tiles.textures)
     textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "tiles"
     tiles.textures = textures
-    spec.worldbody.add_geom(
-        name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0.0, 0.0, 0.05], material="tiles", contype=0, conaffinity=0
-    )
+    floor = spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0.0, 0.0, 0.05])
+    floor.material = "tiles"
