@@ -16,9 +16,6 @@ from eagle_rl.config.validate import CONTROL_STEP
 from eagle_rl.errors import CheckpointError, ConfigError
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from .session import Session
 
 SHEET_FRAMES = 12
@@ -135,6 +132,8 @@ def film(session: Session, script: CommandScript, seconds: float, video: Path | 
     from envs.rendering.recorder import captioned, contact_sheet, evenly, save_picture, video_writer
     from envs.rendering.scene import Stage
 
+    from .session import caption
+
     num_steps = max(1, round(seconds / session.step_dt))
     picks = set(evenly(num_steps, SHEET_FRAMES)) if sheet is not None else set()
     picked = []
@@ -158,13 +157,6 @@ def film(session: Session, script: CommandScript, seconds: float, video: Path | 
     if sheet is not None:
         save_picture(sheet, contact_sheet(picked))
     _report(session, [path for path in (video, sheet) if path is not None])
-
-
-def caption(time: float, command: NDArray[np.float64]) -> str:
-    """Time and command in words."""
-    vx, vy, wz, h, p = command
-    walk = f"forward {vx:+.2f} m/s   left {vy:+.2f} m/s   turn {wz:+.2f} rad/s"
-    return f"{time:5.1f} s    {walk}   height {h:+.2f} m   pitch {p:+.2f} rad"
 
 
 def _report(session: Session, files: Sequence[Path]) -> None:

@@ -64,3 +64,10 @@ class Session:
         self.num_steps += 1
         for row in dones.nonzero().flatten().tolist():
             self.falls[self.specs[row].name].append(self.time)
+
+
+def caption(time: float, command: Array) -> str:
+    """Time and command in words."""
+    vx, vy, wz, h, p = command
+    walk = f"forward {vx:+.2f} m/s   left {vy:+.2f} m/s   turn {wz:+.2f} rad/s"
+    return f"{time:5.1f} s    {walk}   height {h:+.2f} m   pitch {p:+.2f} rad"

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from eagle_rl.cli import export, play, sim2sim
-from eagle_rl.cli.play import caption
+from eagle_rl.cli.session import caption
 from eagle_rl.cli.window import KEYS, STOP, Keyboard
 from eagle_rl.config.schema import CommandsCfg
 from eagle_rl.errors import CheckpointError, ConfigError, RobotError
