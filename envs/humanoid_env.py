@@ -198,9 +198,9 @@ class HumanoidEnv(VecEnv):
 
     def pin_commands(self, command: Tensor | None) -> None:
         """Hold these commands, shape (N, 5), instead of sampling; ``None`` returns to sampling at the next draw."""
-        self._pinned = command
-        if command is not None:
-            self._set_commands(self._all, command.to(self.command))
+        self._pinned = None if command is None else command.to(self.command)
+        if self._pinned is not None:
+            self._set_commands(self._all, self._pinned)
             self._show_commands()
 
     @property
@@ -349,7 +349,7 @@ class HumanoidEnv(VecEnv):
 
     def _draw_commands(self, ids: Tensor) -> None:
         if self._pinned is not None:
-            self._set_commands(ids, self._pinned[ids].to(self.command))
+            self._set_commands(ids, self._pinned[ids])
             return
         command, _ = self.commands.sample(ids, self.command_count[ids])
         self.command_count[ids] += 1
@@ -399,9 +399,9 @@ class HumanoidEnv(VecEnv):
         """Restore what :meth:`state_dict` returned, in an environment built from the same configuration and seed."""
         self.common_step_counter = state["common_step_counter"]
         for name, value in state["buffers"].items():
-            setattr(self, name, value.to(self.device))
+            setattr(self, name, value.to(self.device, copy=True))
         self.state = PooledState(**{name: value.to(self.device) for name, value in state["state"].items()})
-        self.history.frames = state["history"].to(self.device)
+        self.history.frames = state["history"].to(self.device, copy=True)
         self.randomizer.load_state_dict(state["randomizer"])
         self.pool.load_state_dict(state["pool"])
         self.commands.load_state_dict(state["commands"])

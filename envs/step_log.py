@@ -61,7 +61,7 @@ class StepLog:
         ).double()
         if self._sums is None:
             self._sums = rows.new_zeros(len(self._names), rows.shape[1])
-        self._sums.index_add_(0, self._robot_id, rows)
+        self._sums = self._sums.index_add(0, self._robot_id, rows)
         self._steps += 1
 
     def flush(self) -> tuple[dict[str, Tensor], Tensor, Tensor]:
@@ -100,4 +100,6 @@ class StepLog:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`state_dict` returned."""
-        self._sums, self._steps, self._columns = state["sums"], state["steps"], list(state["columns"])
+        sums: Tensor | None = state["sums"]
+        self._sums = None if sums is None else sums.to(self._robot_id.device)
+        self._steps, self._columns = state["steps"], list(state["columns"])

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
     from eagle_rl.evaluation.evaluate import EvaluationResult
     from eagle_rl.evaluation.report import Table
+    from eagle_rl.models import EagleActor
 
 METHODS = {
     "ppo": "PPO",
@@ -56,10 +57,11 @@ def _parser() -> argparse.ArgumentParser:
 
 @dataclass(frozen=True)
 class _Candidate:
-    """One checkpoint to judge."""
+    """One policy to judge."""
 
     method: str
-    checkpoint: Path
+    actor: EagleActor
+    sha256: str
     cfg: ExperimentCfg
 
 
@@ -71,12 +73,14 @@ def _split(word: str) -> tuple[str | None, Path]:
 
 def _candidate(name: str | None, path: Path) -> _Candidate:
     from eagle_rl.config.load import experiment_from_plain
-    from eagle_rl.runners.checkpoint import read_manifest
+    from eagle_rl.runners.checkpoint import load_actor
     from eagle_rl.runners.locate import find_checkpoint
 
     checkpoint = find_checkpoint(path)
-    cfg = experiment_from_plain(read_manifest(checkpoint)["config"], str(checkpoint))
-    return _Candidate(name or METHODS.get(cfg.name, cfg.name), checkpoint, cfg)
+    actor, manifest = load_actor(checkpoint)
+    cfg = experiment_from_plain(manifest["config"], str(checkpoint))
+    method = name or METHODS.get(cfg.name, cfg.name)
+    return _Candidate(method, actor.to(cfg.run.device), manifest["sha256"], cfg)
 
 
 def _protocol(ev: EvaluationCfg, args: argparse.Namespace) -> EvaluationCfg:
@@ -99,19 +103,17 @@ def _judge(candidate: _Candidate, ev: EvaluationCfg, robots: str | None, console
     from rich.progress import Progress
 
     from eagle_rl.evaluation.evaluate import EvaluationResult, evaluate
-    from eagle_rl.runners.checkpoint import load_actor
 
     from .environment import make_env_factory
 
     cfg = candidate.cfg
     names = tuple(robots.split(",")) if robots and robots != "all" else cfg.robots
     torch.set_num_threads(cfg.run.torch_threads)
-    actor, manifest = load_actor(candidate.checkpoint, cfg.run.device)
     make_env = make_env_factory(cfg.run)
     with Progress(console=console, transient=True) as progress:
         bar = progress.add_task(candidate.method, total=len(names) * ev.num_envs_per_robot * ev.num_steps)
-        scores = evaluate(actor, make_env, names, cfg.task, ev, on_step=lambda n: progress.advance(bar, n))
-    return EvaluationResult(checkpoint=manifest["sha256"], protocol=ev, robots=scores, seed=cfg.seed)
+        scores = evaluate(candidate.actor, make_env, names, cfg.task, ev, on_step=lambda n: progress.advance(bar, n))
+    return EvaluationResult(checkpoint=candidate.sha256, protocol=ev, robots=scores, seed=cfg.seed)
 
 
 def main(argv: Sequence[str]) -> int:

@@ -13,8 +13,7 @@ from eagle_rl.config.schema import ExperimentCfg
 from eagle_rl.errors import ConfigError
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
+    from eagle_rl.evaluation.plots import Figure
     from eagle_rl.models import EagleActor
 
 FIGURES = {
@@ -93,12 +92,13 @@ def _curves(args: argparse.Namespace) -> dict[str, Figure]:
 def _rounds(args: argparse.Namespace) -> dict[str, Figure]:
     from eagle_rl.evaluation import plots
     from eagle_rl.evaluation.curves import read_rounds
-    from eagle_rl.runners.records import read_plan, stage_dir
+    from eagle_rl.runners.judged import judged_stages
+    from eagle_rl.runners.records import read_plan
 
     figures = {}
     for name, run in map(_named, args.paths):
-        stages = [(s.round, s.kind == "specialist", stage_dir(run, s.name) / "evaluation.json") for s in read_plan(run)]
-        figures[name] = plots.error_rounds(read_rounds(stages))
+        judged = [(stage.round, stage.kind == "specialist", file) for stage, file in judged_stages(run, read_plan(run))]
+        figures[name] = plots.error_rounds(read_rounds(judged))
     return figures
 
 

@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from eagle_rl.config.compose import known_names
 from eagle_rl.config.load import load_experiment, to_yaml
@@ -15,6 +16,9 @@ from eagle_rl.runners.plan import plan_stages
 from eagle_rl.runners.provenance import Provenance, content_hash, slot_table_hash
 
 from .run_directory import create_run, open_run
+
+if TYPE_CHECKING:
+    from eagle_rl.runners.team import Team
 
 LOG_WIDTH = 160
 """Columns of tables where the output is not a terminal."""
@@ -93,21 +97,26 @@ def main(argv: Sequence[str]) -> int:
         return 0
     provenance = _provenance(cfg)
     _check_device(cfg)
-    run_dir = args.resume or create_run(cfg, args.out, provenance)
-    _train(cfg, run_dir, args, provenance)
+
+    from eagle_rl.runners.team import Team
+
+    team = Team(cfg.run.device)
+    run_dir = args.resume or team.agree(lambda: create_run(cfg, args.out, provenance))
+    _train(cfg, run_dir, args, provenance, team)
     return 0
 
 
-def _train(cfg: ExperimentCfg, run_dir: Path, args: argparse.Namespace, provenance: Provenance) -> None:
+def _train(cfg: ExperimentCfg, run_dir: Path, args: argparse.Namespace, provenance: Provenance, team: Team) -> None:
     from rich.console import Console
 
+    from eagle_rl.runners.judged import judged_results
     from eagle_rl.runners.stages import run_experiment
 
     from .environment import make_env_factory
     from .mdp_summary import print_mdp
-    from .tracking import print_tracking, stage_results
+    from .tracking import print_tracking
 
-    console = Console()
+    console = Console(quiet=not team.leads)
     if not console.is_terminal:
         console.width = max(console.width, LOG_WIDTH)
     print_mdp(cfg.task, console)
@@ -121,6 +130,7 @@ def _train(cfg: ExperimentCfg, run_dir: Path, args: argparse.Namespace, provenan
         console=console,
         provenance=provenance,
         allow_drift=args.allow_drift,
+        team=team,
     )
-    print_tracking(stage_results(run_dir, plan_stages(cfg)), console)
+    print_tracking(judged_results(run_dir, plan_stages(cfg)), console)
     console.print(_NEXT.format(run=run_dir), highlight=False)

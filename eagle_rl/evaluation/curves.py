@@ -81,16 +81,14 @@ def read_rounds(stages: Sequence[tuple[int, bool, Path]]) -> list[RoundScores]:
     """Scores of every judged stage of a run.
 
     Args:
-        stages: round, whether it is a specialist, and the file of its evaluation, for every stage.
+        stages: round, whether it is a specialist, and the file of its result, for every judged stage.
     """
     scores = []
     for number, specialist, path in stages:
-        if path.exists():
-            for robot, metrics in EvaluationResult.read(path).robots.items():
-                charged = metrics.subsets["all"].charged
-                errors = tuple(math.nan if e is None else e for e in charged)
-                position = number - 0.5 if specialist else float(number)
-                scores.append(RoundScores(robot=robot, specialist=specialist, position=position, errors=errors))
+        for robot, metrics in EvaluationResult.read(path).robots.items():
+            errors = tuple(math.nan if e is None else e for e in metrics.subsets["all"].charged)
+            position = number - 0.5 if specialist else float(number)
+            scores.append(RoundScores(robot=robot, specialist=specialist, position=position, errors=errors))
     if not scores:
         raise ConfigError("No stage of the run has been judged: plan.judge_envs_per_robot is 0, or none is done yet.")
     return scores

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure as Figure  # re-exported, so that only this module names matplotlib
 from numpy.typing import NDArray
 
 from eagle_rl.evaluation.curves import Curve, RoundScores

@@ -19,6 +19,7 @@ from eagle_rl.config.schema import GaitCfg, RewardsCfg
 from ..robots.slots import HIP_DEVIATION_SLOTS, UPPER_SLOTS
 from ..state import PooledRobots, PooledState
 from . import gait
+from .layout import REFERENCE_MASS
 
 SHAPING_KAPPA = 1e4
 """Widening of the contact-force kernel at full gait shaping for a robot of 33 kg [N^2], growing with the square of the
@@ -100,7 +101,7 @@ def contact_force(state: PooledState, robots: PooledRobots, ctx: RewardContext) 
 
     The norm is over all three components, else a vertically loaded swing foot goes unpunished (HugWBC 11.2).
     """
-    kappa = ctx.cfg.contact_force_kappa + SHAPING_KAPPA * ctx.gait_shaping * (robots.total_mass / 33.0).square()
+    kappa = ctx.cfg.contact_force_kappa + SHAPING_KAPPA * ctx.gait_shaping * (robots.total_mass / REFERENCE_MASS).square()
     loaded = 1.0 - _rho(_square_sum(state.foot_force_w), kappa.unsqueeze(1))
     return _dot(1.0 - ctx.contact_probability(state), loaded)
 

@@ -91,6 +91,13 @@ def test_naming_a_task_starts_it_afresh_and_its_own_keys_come_on_top():
     assert isinstance(task.gait.frequency, float)
 
 
+def test_a_base_given_as_a_path_is_looked_for_beside_its_file():
+    Path("mine").mkdir()
+    Path("mine/first.yaml").write_text("base: ppo\nseed: 7\n", encoding="utf-8")
+    Path("mine/second.yaml").write_text("base: first.yaml\n", encoding="utf-8")
+    assert load_experiment("mine/second.yaml").seed == 7
+
+
 def test_a_path_names_the_experiment_after_its_file():
     assert load_experiment(write("base: ppo\n")).name == "mine"
 

@@ -143,7 +143,6 @@ def test_specialists_stand_half_a_round_before_the_generalist_they_teach(tmp_pat
             (0, False, judged(tmp_path, "generalist.json", ["h1", "g1"])),
             (1, True, judged(tmp_path, "h1.json", ["h1"])),
             (1, False, judged(tmp_path, "distill.json", ["h1", "g1"])),
-            (2, True, tmp_path / "not_there_yet.json"),
         ]
     )
     assert [(s.robot, s.position) for s in scores] == [("h1", 0), ("g1", 0), ("h1", 0.5), ("h1", 1), ("g1", 1)]
