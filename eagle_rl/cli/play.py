@@ -1,4 +1,4 @@
-"""``eagle play``: a checkpoint in motion, several robots side by side, in a window or as a video."""
+"""``eagle play``: a checkpoint in motion, several robots side by side, in a browser, a window or as a video."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import argparse
 import contextlib
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -36,8 +36,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--robots", metavar="A,B|all", help="robots to show [those it was trained on]")
     parser.add_argument(
         "--viewer",
-        choices=("native", "none"),
-        help="native opens a window [if there is a display and no file is asked for]",
+        choices=("web", "native", "none"),
+        help="web serves browsers, native opens a window [native if there is a display and no file is asked for]",
     )
     parser.add_argument("--video", type=Path, metavar="FILE.mp4", help="write a video")
     parser.add_argument("--contact-sheet", type=Path, metavar="FILE.png", help="write twelve frames as one picture")
@@ -111,16 +111,29 @@ def main(argv: Sequence[str]) -> int:
             check_writable(path, suffix)
 
     checkpoint = find_checkpoint(args.checkpoint or newest_run())
-    if viewer == "native":
-        from .window import watch
-
-        session = _load(args, checkpoint, args.seconds or 1e6)
-        watch(session, script if args.commands else None, args.seconds)
-    else:
+    if viewer == "none":
         seconds = args.seconds or script.duration
         video = args.video if files else checkpoint.with_suffix(".mp4")
         film(_load(args, checkpoint, seconds), script, seconds, video, args.contact_sheet)
+    else:
+        watch = _viewer(viewer)
+        watch(_load(args, checkpoint, args.seconds or 1e6), script if args.commands else None, args.seconds)
     return 0
+
+
+def _viewer(kind: str) -> Callable[[Session, CommandScript | None, float | None], None]:
+    """The function that shows a session live."""
+    if kind == "native":
+        from .window import watch
+
+        return watch
+    try:
+        from .browser import serve
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            f"--viewer web needs {error.name}: pip install viser. Or make a video: --video robots.mp4"
+        ) from error
+    return serve
 
 
 def film(session: Session, script: CommandScript, seconds: float, video: Path | None, sheet: Path | None) -> None:
