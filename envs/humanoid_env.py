@@ -297,11 +297,12 @@ class HumanoidEnv(VecEnv):
         robots = self.robots if ids is None else self.robots.rows(ids)
         embodiment = self.embodiment if ids is None or self.embodiment is None else self.embodiment[ids]
         frames = self.history.frames if ids is None else self.history.frames[ids]
+        frame = self._last_frame if ids is None else self._last_frame[ids]
         groups = {
             "history": frames.flatten(1),
             "command": command_observation(state, cfg),
             "clock": clock(state.foot_phase),
-            "critic": critic_observation(state, robots, embodiment, cfg, self.task.randomization.friction),
+            "critic": critic_observation(frame, state, robots, embodiment, cfg, self.task.randomization.friction),
             "estimate": estimation_target(state, embodiment, cfg),
             "slot_mask": robots.slot_mask,
         }
