@@ -14,6 +14,7 @@ from torch import Tensor
 
 from eagle_rl.config.schema import TaskCfg
 
+from .mdp.active_commands import ActiveCommands
 from .mdp.aids import LearningAids, harness_damping, harness_wrench
 from .mdp.commands import CommandSampler
 from .mdp.curriculum import penalty_scale
@@ -100,7 +101,8 @@ class HumanoidEnv(VecEnv):
             torch.cat([torch.arange(count) for count in counts]).to(self.device),
         )
         self.randomizer = Randomizer(task.randomization, self.pool, self.robots, self.rng)
-        self.commands = CommandSampler(task.commands, self.robots, len(robots), self.rng, self.step_dt)
+        sampler = CommandSampler(task.commands, self.robots, len(robots), self.rng, self.step_dt)
+        self.commands = ActiveCommands(sampler, round(task.commands.resampling_time_s / self.step_dt), dtype)
         self.aids = LearningAids(task.aids, len(robots), self.device)
         observations = task.observations
         self.embodiment = (
@@ -113,7 +115,6 @@ class HumanoidEnv(VecEnv):
         self._noise = noise_scale(observations, self.robots)
         self.step_log = StepLog(self.robot_names, self.robots.robot_id)
         self._all = torch.arange(num_envs, device=self.device)
-        self._pinned: Tensor | None = None
         self._allocate(dtype)
         self._set_harness_damping()
         self._reset(self._all)
@@ -125,10 +126,7 @@ class HumanoidEnv(VecEnv):
         self.episode_length_buf = torch.zeros(n, dtype=torch.long, device=device)
         self.episode_count = torch.zeros(n, dtype=torch.long, device=device)
         self.step_count = torch.zeros(n, dtype=torch.long, device=device)
-        self.command_count = torch.zeros(n, dtype=torch.long, device=device)
         self.phase = torch.zeros(n, dtype=dtype, device=device)
-        self.command = torch.zeros(n, 5, dtype=dtype, device=device)
-        self.standing = torch.zeros(n, dtype=torch.bool, device=device)
         zeros = torch.zeros(n, NUM_SLOTS, dtype=dtype, device=device)
         self._actions, self._last_actions, self._last_last_actions = zeros, zeros, zeros
         self._last_joint_vel = zeros
@@ -188,6 +186,11 @@ class HumanoidEnv(VecEnv):
         """Observation groups at the present state, fresh tensors."""
         return self._groups(None)
 
+    @property
+    def command(self) -> Tensor:
+        """Commands in force (v_x, v_y, omega, h, p), shape (N, 5)."""
+        return self.commands.command
+
     def tracking_errors(self) -> Tensor:
         """Absolute error of each command at the last step [m/s, m/s, rad/s, m, rad], shape (N, 5)."""
         return tracking_errors(self.state, self.robots)
@@ -198,10 +201,8 @@ class HumanoidEnv(VecEnv):
 
     def pin_commands(self, command: Tensor | None) -> None:
         """Hold these commands, shape (N, 5), instead of sampling; ``None`` returns to sampling at the next draw."""
-        self._pinned = None if command is None else command.to(self.command)
-        if self._pinned is not None:
-            self._set_commands(self._all, self._pinned)
-            self._show_commands()
+        self.commands.pin(command)
+        self.commands.show(self.state, self.phase, self.task.gait)
 
     @property
     def penalty_scale(self) -> float:
@@ -244,6 +245,7 @@ class HumanoidEnv(VecEnv):
     def _derive(self, staged: Tensor, ids: Tensor | None = None) -> PooledState:
         """Turn staging rows into the pooled state, with the command, phase and actions now in force."""
         physical = measured(staged, self.pool.columns)
+        standing = self.commands.standing
 
         def of(buffer: Tensor) -> Tensor:
             return buffer if ids is None else buffer[ids]
@@ -257,8 +259,8 @@ class HumanoidEnv(VecEnv):
             height_scan=staged.new_zeros(len(staged), self.layout.num_scan_points),
             friction=of(self.randomizer.friction),
             command=of(self.command),
-            standing=of(self.standing),
-            foot_phase=foot_phases(of(self.phase), of(self.standing), self.task.gait),
+            standing=of(standing),
+            foot_phase=foot_phases(of(self.phase), of(standing), self.task.gait),
             actions=of(self._actions),
             last_actions=of(self._last_actions),
             last_last_actions=of(self._last_last_actions),
@@ -275,8 +277,7 @@ class HumanoidEnv(VecEnv):
         rewards, terms = compute_rewards(self.state, self.robots, context, self.penalty_scale, self.step_dt)
         self._last_joint_vel = self.state.joint_vel
         self._last_contact = self.state.foot_contact
-        if self._pinned is None:
-            self.commands.accumulate(*success_scores(self.state, self.robots, context))
+        self.commands.judge(success_scores(self.state, self.robots, context))
         return rewards, terms
 
     def _observe(self) -> None:
@@ -317,7 +318,7 @@ class HumanoidEnv(VecEnv):
         self.episode_count[ids] += 1
         self.episode_length_buf = self.episode_length_buf.index_fill(0, ids, 0)
         self.phase = self.phase.index_fill(0, ids, 0.0)
-        self._draw_commands(ids)
+        self.commands.draw(ids)
         for name in ("_actions", "_last_actions", "_last_last_actions", "_last_contact"):
             setattr(self, name, getattr(self, name).index_fill(0, ids, 0))
         self._last_joint_vel = self._last_joint_vel.index_copy(0, ids, staged[:, self.pool.columns["joint_vel"]])
@@ -334,29 +335,10 @@ class HumanoidEnv(VecEnv):
 
     def _resample(self) -> None:
         """Draw new commands where their time is up."""
-        interval = round(self.task.commands.resampling_time_s / self.step_dt)
-        ids = ((self.episode_length_buf % interval == 0) & (self.episode_length_buf > 0)).nonzero().squeeze(1)
+        ids = self.commands.due(self.episode_length_buf)
         if len(ids):
-            self._draw_commands(ids)
-            self._show_commands()
-
-    def _show_commands(self) -> None:
-        """Let the present state, and so the next observation, show the commands now in force."""
-        self.state.command, self.state.standing = self.command, self.standing
-        self.state.foot_phase = foot_phases(self.phase, self.standing, self.task.gait)
-
-    def _draw_commands(self, ids: Tensor) -> None:
-        if self._pinned is not None:
-            self._set_commands(ids, self._pinned[ids])
-            return
-        command, _ = self.commands.sample(ids, self.command_count[ids])
-        self.command_count[ids] += 1
-        self._set_commands(ids, command)
-
-    def _set_commands(self, ids: Tensor, command: Tensor) -> None:
-        """Put commands in force; standing means all three velocities are zero (HugWBC 1)."""
-        self.command = self.command.index_copy(0, ids, command.to(self.command.dtype))
-        self.standing = (self.command[:, :3] == 0).all(dim=1)
+            self.commands.draw(ids)
+            self.commands.show(self.state, self.phase, self.task.gait)
 
     def _account(
         self, terms: dict[str, Tensor], reasons: dict[str, Tensor], causes: Tensor, dones: Tensor, time_outs: Tensor
@@ -376,8 +358,8 @@ class HumanoidEnv(VecEnv):
     # --- exact resume -------------------------------------------------------------------------------------------------
 
     _BUFFERS = (
-        "episode_length_buf episode_count step_count command_count phase command standing _actions _last_actions "
-        "_last_last_actions _last_joint_vel _last_contact _last_frame"
+        "episode_length_buf episode_count step_count phase _actions _last_actions _last_last_actions _last_joint_vel "
+        "_last_contact _last_frame"
     ).split()
 
     _PARTS = ("randomizer", "pool", "commands", "aids", "step_log")

@@ -77,7 +77,7 @@ def diagnose(
 
 
 def _sound(qpos: Array, qvel: Array) -> bool:
-    """Whether every simulation is finite and within bounds, by whole-array sums and extremes: the usual case, cheaply."""
+    """Whether all simulations are finite and within bounds, by whole-array sums and extremes: the usual case."""
     return bool(
         np.isfinite(qpos.sum())
         and qvel.max() <= MAX_SPEED
