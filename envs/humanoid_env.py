@@ -14,6 +14,7 @@ from torch import Tensor
 
 from eagle_rl.config.schema import TaskCfg
 
+from .ground import make_ground
 from .mdp.active_commands import ActiveCommands
 from .mdp.aids import LearningAids, harness_damping, harness_wrench
 from .mdp.commands import CommandSampler
@@ -29,6 +30,7 @@ from .mdp.observations import (
     estimation_target,
     noise_scale,
     proprioception,
+    scan_points,
 )
 from .mdp.randomization import Randomizer
 from .mdp.rewards import RewardContext, compute_rewards, success_scores
@@ -43,6 +45,7 @@ from .robots.spec import RobotSpec
 from .sim.batch import RobotBatch
 from .sim.health import MAX_ACTION
 from .sim.pool import PhysicsPool
+from .sim.terrain import build_terrain
 from .state import PooledState
 from .step_log import StepLog, episode_ratio
 
@@ -89,8 +92,10 @@ class HumanoidEnv(VecEnv):
         self.max_episode_length = round(task.terminations.episode_length_s / self.step_dt)
         self.robot_names = [spec.name for spec in robots]
         counts = share(num_envs, len(robots))
+        terrain = build_terrain(task.terrain, seed)
+        field = terrain.field if terrain is not None else None
         batches = [
-            RobotBatch(spec, build_model(spec, task.sim), count, task.sim.decimation, num_threads)
+            RobotBatch(spec, build_model(spec, task.sim, field), count, task.sim.decimation, num_threads)
             for spec, count in zip(robots, counts, strict=True)
         ]
         self.pool = PhysicsPool(batches, self.device, dtype)
@@ -105,15 +110,18 @@ class HumanoidEnv(VecEnv):
         self.commands = ActiveCommands(sampler, round(task.commands.resampling_time_s / self.step_dt), dtype)
         self.aids = LearningAids(task.aids, len(robots), self.device)
         observations = task.observations
+        points = scan_points(observations).to(self.device, dtype)
+        robot_id = self.robots.robot_id
+        self.ground = make_ground(terrain, points, robot_id, self.rng, self.step_dt, self.max_episode_length)
         self.embodiment = (
-            pooled_embodiment(robots, self.robots.robot_id, self.randomizer.bodies, observations.descriptor)
+            pooled_embodiment(robots, robot_id, self.randomizer.bodies, observations.descriptor)
             if observations.embodiment_observation
             else None
         )
         self.layout = ObservationLayout(observations)
         self.mirror = self.layout.mirror(self.device)
         self._noise = noise_scale(observations, self.robots)
-        self.step_log = StepLog(self.robot_names, self.robots.robot_id)
+        self.step_log = StepLog(self.robot_names, robot_id)
         self._all = torch.arange(num_envs, device=self.device)
         self._allocate(dtype)
         self._set_harness_damping()
@@ -162,7 +170,8 @@ class HumanoidEnv(VecEnv):
         self.state = self._derive(staged)
         reasons = terminations(self.state, self.task.terminations)
         fallen = torch.stack(list(reasons.values())).any(dim=0) & ~sick
-        time_outs = (self.episode_length_buf >= self.max_episode_length) & ~fallen & ~sick
+        over = (self.episode_length_buf >= self.max_episode_length) | self.ground.left(self.state.root_pos_w)
+        time_outs = over & ~fallen & ~sick
         dones = fallen | sick | time_outs
         rewards, terms = self._rewards(fallen)
         rewards = rewards.masked_fill(sick, 0.0)
@@ -252,11 +261,9 @@ class HumanoidEnv(VecEnv):
 
         return PooledState(
             **physical,
-            base_height=physical["root_pos_w"][:, 2],
+            **self.ground.measure(physical["root_pos_w"], physical["root_quat_w"], physical["foot_pos_w"]),
             joint_acc=(physical["joint_vel"] - of(self._last_joint_vel)) / self.step_dt,
-            foot_height=physical["foot_pos_w"][..., 2],
             last_foot_contact=of(self._last_contact),
-            height_scan=staged.new_zeros(len(staged), self.layout.num_scan_points),
             friction=of(self.randomizer.friction),
             command=of(self.command),
             standing=of(standing),
@@ -277,7 +284,9 @@ class HumanoidEnv(VecEnv):
         rewards, terms = compute_rewards(self.state, self.robots, context, self.penalty_scale, self.step_dt)
         self._last_joint_vel = self.state.joint_vel
         self._last_contact = self.state.foot_contact
-        self.commands.judge(success_scores(self.state, self.robots, context))
+        scores = success_scores(self.state, self.robots, context)
+        self.commands.judge(scores)
+        self.ground.judge(scores[0], self.state)
         return rewards, terms
 
     def _observe(self) -> None:
@@ -312,9 +321,11 @@ class HumanoidEnv(VecEnv):
 
     def _reset(self, ids: Tensor) -> None:
         """Start new episodes; other environments are untouched, bit for bit."""
-        self.randomizer.reset(ids, self.episode_count[ids], self.step_dt)
-        root, joint_pos, joint_vel = self.randomizer.initial_state(ids, self.episode_count[ids])
-        staged = self.pool.reset(ids, root, joint_pos, joint_vel)
+        count = self.episode_count[ids]
+        self.ground.advance(ids, count, self.state.rows(ids), self.episode_length_buf[ids])
+        self.randomizer.reset(ids, count, self.step_dt)
+        root, joint_pos, joint_vel = self.randomizer.initial_state(ids, count)
+        staged = self.pool.reset(ids, self.ground.place(ids, count, root), joint_pos, joint_vel)
         self.episode_count[ids] += 1
         self.episode_length_buf = self.episode_length_buf.index_fill(0, ids, 0)
         self.phase = self.phase.index_fill(0, ids, 0.0)
@@ -352,8 +363,9 @@ class HumanoidEnv(VecEnv):
         entry, falls_per_step, match_per_robot = self.step_log.flush()
         self.aids.update(episode_ratio(falls_per_step, self.max_episode_length), match_per_robot)
         self._set_harness_damping()
-        k = torch.tensor(self.penalty_scale)
-        return entry | self.commands.log() | self.aids.log(self.robot_names) | {"Curriculum/penalty_scale": k}
+        entry["Curriculum/penalty_scale"] = torch.tensor(self.penalty_scale)
+        names = self.robot_names
+        return entry | self.commands.log() | self.aids.log(names) | self.ground.log(names)
 
     # --- exact resume -------------------------------------------------------------------------------------------------
 
@@ -362,7 +374,7 @@ class HumanoidEnv(VecEnv):
         "_last_contact _last_frame"
     ).split()
 
-    _PARTS = ("randomizer", "pool", "commands", "aids", "step_log")
+    _PARTS = ("randomizer", "pool", "commands", "ground", "aids", "step_log")
     """What has a state of its own; randomization first, because the physics is recomputed under it."""
 
     def state_dict(self) -> dict[str, Any]:
