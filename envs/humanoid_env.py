@@ -49,9 +49,6 @@ from .sim.terrain import build_terrain
 from .state import PooledState
 from .step_log import StepLog, episode_ratio
 
-LOG_INTERVAL = 24
-"""Control steps between entries in ``extras["log"]``."""
-
 
 class HumanoidEnv(VecEnv):
     """Whole-body command tracking by a mixed fleet of humanoids.
@@ -99,13 +96,14 @@ class HumanoidEnv(VecEnv):
             for spec, count in zip(robots, counts, strict=True)
         ]
         self.pool = PhysicsPool(batches, self.device, dtype)
-        self.robots = pool_robots(robots, counts, task.control, task.rewards, self.device, dtype)
+        nominal = pool_robots(robots, counts, task.control, task.rewards, self.device, dtype)
         self.rng = CounterRng(
             seed,
             [name for name, count in zip(self.robot_names, counts, strict=True) for _ in range(count)],
             torch.cat([torch.arange(count) for count in counts]).to(self.device),
         )
-        self.randomizer = Randomizer(task.randomization, self.pool, self.robots, self.rng)
+        self.randomizer = Randomizer(task.randomization, self.pool, nominal, self.rng)
+        self.robots = self.randomizer.robots
         sampler = CommandSampler(task.commands, self.robots, len(robots), self.rng, self.step_dt)
         self.commands = ActiveCommands(sampler, round(task.commands.resampling_time_s / self.step_dt), dtype)
         self.aids = LearningAids(task.aids, len(robots), self.device)
@@ -354,11 +352,11 @@ class HumanoidEnv(VecEnv):
     def _account(
         self, terms: dict[str, Tensor], reasons: dict[str, Tensor], causes: Tensor, dones: Tensor, time_outs: Tensor
     ) -> dict[str, Tensor | float]:
-        """Add the step to the log and the aids; returns tags and values once per ``LOG_INTERVAL``."""
+        """Add the step to the log and the aids; returns tags and values now and then."""
         match = contact_match(self.state, self.task.gait)
         falls = dones & ~time_outs
         self.step_log.add(terms, reasons, causes, self.tracking_errors(), match, falls, dones, self.state.standing)
-        if self.common_step_counter % LOG_INTERVAL:
+        if self.common_step_counter % self.task.aids.interval_steps:
             return {}
         entry, falls_per_step, match_per_robot = self.step_log.flush()
         self.aids.update(episode_ratio(falls_per_step, self.max_episode_length), match_per_robot)

@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from eagle_rl.config.schema import AidsCfg, CommandsCfg, RandomizationCfg, TaskCfg, TerminationsCfg
-from envs.humanoid_env import LOG_INTERVAL, HumanoidEnv
-from tests.envs.worlds import BARE, actions, assert_same, make_env
+from envs.humanoid_env import HumanoidEnv
+from tests.envs.worlds import BARE, LOG_INTERVAL, actions, assert_same, make_env
 
 BUSY = replace(
     TaskCfg(),
