@@ -1,3 +1,4 @@
+#!/usr/bin/env python3
 """Show a checkpoint: ``python play.py CHECKPOINT --video five.mp4``. The same as ``eagle play``."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Packaging. ``cfg`` and ``assets`` live at the top of the repository and travel in the package as ``eagle_rl/data``."""
+"""Packaging. ``cfg`` and ``assets`` live at the top of the repository and travel inside the package."""
 
 from __future__ import annotations
 
@@ -59,8 +59,8 @@ setup(
         "packaging>=22.0",
         "PyYAML>=6.0",
         "rich>=13.0",
-        "imageio>=2.30",
         "imageio-ffmpeg>=0.4.9",
+        "pillow>=10.1",
         "matplotlib>=3.8",
         "scikit-learn>=1.3",
         "safetensors>=0.4",
@@ -71,8 +71,7 @@ setup(
     extras_require={
         "dev": [
             "build>=1.0",
-            "setuptools>=68",
-            "wheel>=0.40",
+            "setuptools>=70.1",
             "pytest>=8.0",
             "pytest-cov>=5.0",
             "pytest-xdist>=3.5",
@@ -81,8 +80,6 @@ setup(
             "mypy>=1.13",
             "types-PyYAML>=6.0",
         ],
-        "viewer": ["viser>=0.2"],
-        "wandb": ["wandb>=0.17"],
     },
     classifiers=[
         "Programming Language :: Python :: 3",

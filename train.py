@@ -1,3 +1,4 @@
+#!/usr/bin/env python3
 """Train an experiment: ``python train.py quickstart``. The same as ``eagle train``."""
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ def share(num_envs: int, num_robots: int) -> list[int]:
         ConfigError: fewer environments than robots.
     """
     if num_envs < num_robots:
-        raise ConfigError(f"num_envs: got {num_envs}, expected at least one environment for each of {num_robots} robots.")
+        raise ConfigError(f"num_envs: got {num_envs}, expected at least one for each of {num_robots} robots.")
     base, extra = divmod(num_envs, num_robots)
     return [base + (robot < extra) for robot in range(num_robots)]
 

@@ -1,6 +1,6 @@
 """Random numbers that depend only on (seed, robot, environment, stream, count), never on who else is drawing.
 
-There is no generator state: each number is a hash of its coordinates (a splitmix64 finalizer per coordinate). So adding
+There is no generator state: each number is a hash of its coordinates (finalizers of splitmix64). So adding
 a robot or an environment moves nobody else's noise, a resumed run needs only its counters, and CPU and GPU agree.
 """
 
@@ -23,14 +23,14 @@ def _stream_key(stream: str) -> int:
 
 def _shift_right(x: Tensor, bits: int) -> Tensor:
     """Logical right shift of int64."""
-    return (x >> bits) & ((1 << (64 - bits)) - 1)
+    return (x >> bits).bitwise_and_((1 << (64 - bits)) - 1)
 
 
 def _mix(x: Tensor) -> Tensor:
-    """Finalizer of splitmix64: a bijection on 64-bit integers that scatters nearby inputs."""
-    x = (x ^ _shift_right(x, 30)) * _MIX_1
-    x = (x ^ _shift_right(x, 27)) * _MIX_2
-    return x ^ _shift_right(x, 31)
+    """Finalizer of splitmix64, a bijection on 64-bit integers that scatters nearby inputs; overwrites ``x``."""
+    x.bitwise_xor_(_shift_right(x, 30)).mul_(_MIX_1)
+    x.bitwise_xor_(_shift_right(x, 27)).mul_(_MIX_2)
+    return x.bitwise_xor_(_shift_right(x, 31))
 
 
 class CounterRng:
@@ -47,6 +47,8 @@ class CounterRng:
         names = torch.tensor([zlib.crc32(name.encode()) for name in robot_names], device=env_indices.device)
         key = _mix(torch.full_like(env_indices, seed) * _GOLDEN + 1)
         self.key = _mix(_mix(key + names * _GOLDEN) + env_indices * _GOLDEN)
+        self._stream_keys: dict[str, Tensor] = {}
+        self._columns: dict[int, Tensor] = {}
 
     def uniform(self, stream: str, count: Tensor, size: int, ids: Tensor | None = None) -> Tensor:
         """Numbers uniform in [0, 1).
@@ -60,11 +62,10 @@ class CounterRng:
         Returns:
             Float32 tensor, shape (n, size); 24 random bits each.
         """
-        key = self.key if ids is None else self.key[ids]
-        key = _mix(key + _stream_key(stream)) + count * _GOLDEN
-        columns = torch.arange(1, size + 1, device=key.device) * _GOLDEN
-        bits = _shift_right(_mix(_mix(key).unsqueeze(1) + columns), 40)
-        return bits.to(torch.float32) * (1.0 / (1 << 24))
+        key = self._stream_key(stream)
+        key = (key if ids is None else key[ids]) + count * _GOLDEN
+        words = _mix(key.unsqueeze(1) + self._column_keys(size)).view(torch.int32)  # two numbers a hash
+        return (words[:, :size] >> 8).to(torch.float32).mul_(2.0**-24).add_(0.5)
 
     def uniform_in(
         self,
@@ -77,3 +78,15 @@ class CounterRng:
     ) -> Tensor:
         """Numbers uniform in [low, high), shape (n, size)."""
         return low + (high - low) * self.uniform(stream, count, size, ids)
+
+    def _stream_key(self, stream: str) -> Tensor:
+        """One key per environment for a stream, derived at its first use, shape (N,)."""
+        if stream not in self._stream_keys:
+            self._stream_keys[stream] = _mix(self.key + _stream_key(stream))
+        return self._stream_keys[stream]
+
+    def _column_keys(self, size: int) -> Tensor:
+        """What tells the hashes of one draw apart, shape (half of ``size``, rounded up,)."""
+        if size not in self._columns:
+            self._columns[size] = torch.arange(1, (size + 1) // 2 + 1, device=self.key.device) * _MIX_1
+        return self._columns[size]

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
-from importlib.metadata import PackageNotFoundError, requires
+from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,8 +19,6 @@ from eagle_rl.config.compose import known_names
 from eagle_rl.config.load import load_experiment
 from eagle_rl.errors import EagleError
 from eagle_rl.paths import data_root
-
-from .provenance import installed_version
 
 _RENDER = """
 import mujoco
@@ -52,6 +50,14 @@ def check_packages() -> list[Finding]:
             wanted = "" if good else f", needs {requirement.specifier}; run make setup"
             findings.append(Finding(requirement.name, "ok" if good else "FAIL", found + wanted))
     return findings
+
+
+def installed_version(package: str) -> str:
+    """Version of an installed package, or ``missing``."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "missing"
 
 
 def check_machine() -> list[Finding]:

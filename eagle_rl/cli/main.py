@@ -19,6 +19,7 @@ VERBS: dict[str, str] = {
     "evaluate": "tracking errors and survival of checkpoints: the paper's table",
     "plot": "figures from runs: curves, latents, rounds",
     "export": "a checkpoint as ONNX with its input/output contract",
+    "sim2sim": "an exported policy in plain MuJoCo, without torch",
     "status": "progress of a run and its stages",
     "robots": "list, show or check robots",
     "doctor": "check this installation",
@@ -42,8 +43,8 @@ def guarded(action: Callable[[], int]) -> int:
     except EagleError as error:
         print(f"error: {error}", file=sys.stderr)
         return error.exit_code
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
+    except KeyboardInterrupt as error:
+        print(str(error) or "interrupted", file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:  # the reader, such as head, has left
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

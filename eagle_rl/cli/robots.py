@@ -76,7 +76,7 @@ def _check(name: str, console: Console) -> None:
 
     findings = check_robot(name)
     spec = load_robot(name)
-    verdict = f"{len(findings)} findings" if findings else "in order"
+    verdict = f"{len(findings)} to know" if findings else "in order"
     console.print(f"{spec.name}: {spec.num_joints} joints, {spec.total_mass:.3f} kg: {verdict}", highlight=False)
     for finding in findings:
         console.print(f"  {finding}", highlight=False, markup=False)

@@ -3,26 +3,29 @@
 from __future__ import annotations
 
 import json
+import os
+import platform
+import subprocess
+import sys
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from eagle_rl.config.load import differences, load_experiment, to_yaml
+from eagle_rl.config.load import load_experiment, to_yaml
 from eagle_rl.config.schema import ExperimentCfg
 from eagle_rl.errors import CheckpointError, ConfigError
-
-from .provenance import drift, git_diff
+from eagle_rl.paths import data_root
+from eagle_rl.runners.provenance import Provenance
 
 CONFIG = "config.yaml"
-PROVENANCE = "provenance.json"
 
 _README = """\
 {name}: {description}
 
 config.yaml       every value of this run; eagle train {here}/config.yaml runs it again
 provenance.json   versions, seed, commit, robots' files, command line; uncommitted.diff if there was one
-metrics.jsonl     one line of numbers per iteration; the same numbers for TensorBoard beside it
-checkpoints/      what was learned
+plan.json         the stages of the run, and what it depends on
+stages/           of each: record, checkpoints, evaluation, metrics.jsonl and the same numbers for TensorBoard
 
 Watch the curves   tensorboard --logdir {here}
 Progress           eagle status {here}
@@ -32,29 +35,26 @@ Tracking errors    eagle evaluate {here}
 """
 
 
-def create_run(cfg: ExperimentCfg, out: Path, record: dict[str, Any]) -> Path:
+def create_run(cfg: ExperimentCfg, out: Path, provenance: Provenance) -> Path:
     """Make a new run directory and write what explains the run into it.
 
     Args:
         cfg: the resolved experiment.
         out: folder of all runs.
-        record: the run's provenance.
+        provenance: what the run depends on.
 
     Raises:
         ConfigError: the folder cannot be written.
     """
-    stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
     folder = out / cfg.name
     try:
-        run_dir = _fresh(folder, f"{stamp}_seed{cfg.seed}")
-        (run_dir / CONFIG).write_text(to_yaml(cfg), encoding="utf-8")
-        (run_dir / PROVENANCE).write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
-        (run_dir / "README.txt").write_text(
-            _README.format(name=cfg.name, description=cfg.description, here=run_dir), encoding="utf-8"
-        )
-        changes = git_diff()
-        if changes:
-            (run_dir / "uncommitted.diff").write_text(changes + "\n", encoding="utf-8")
+        run_dir = _fresh(folder, f"{datetime.now():%Y-%m-%d_%H-%M-%S}_seed{cfg.seed}")
+        readme = _README.format(name=cfg.name, description=cfg.description, here=run_dir)
+        record = json.dumps(_record(cfg, provenance), indent=2)
+        texts = {CONFIG: to_yaml(cfg), "provenance.json": record + "\n", "README.txt": readme}
+        texts |= {"uncommitted.diff": diff} if (diff := _uncommitted()) else {}
+        for name, text in texts.items():
+            (run_dir / name).write_text(text, encoding="utf-8")
     except OSError as error:
         raise ConfigError(
             f"{folder}: no run directory can be made: {error.strerror}. Choose another with --out."
@@ -65,17 +65,43 @@ def create_run(cfg: ExperimentCfg, out: Path, record: dict[str, Any]) -> Path:
 def _fresh(folder: Path, name: str) -> Path:
     """A folder that did not exist before, even if two runs start in the same second."""
     folder.mkdir(parents=True, exist_ok=True)
-    for suffix in ("", *(f"_{i}" for i in range(2, 1000))):
+    number = 1
+    while True:
         try:
-            (folder / f"{name}{suffix}").mkdir()
+            path = folder / (name if number == 1 else f"{name}_{number}")
+            path.mkdir()
         except FileExistsError:
-            continue
-        return folder / f"{name}{suffix}"
-    raise FileExistsError(17, "a thousand runs started in one second")
+            number += 1
+        else:
+            return path
 
 
-def open_run(run_dir: Path, overrides: list[str]) -> tuple[ExperimentCfg, list[str]]:
-    """The configuration of an existing run with overrides on top, and on which keys they change it.
+def _record(cfg: ExperimentCfg, provenance: Provenance) -> dict[str, Any]:
+    """Who, what and when, for a reader; what a resumed run is checked against is in the plan."""
+    manifest = provenance.as_manifest()
+    kept = ("config_hash", "robot_hashes", "slot_table_hash", "versions", "git_commit")
+    return {
+        "created": datetime.now().astimezone().isoformat(timespec="seconds"),
+        "command": sys.argv,
+        "seed": cfg.seed,
+        "platform": platform.platform(),
+        "cpu_count": os.cpu_count(),
+        **{key: manifest[key] for key in kept},
+    }
+
+
+def _uncommitted() -> str:
+    """Changes of tracked files against the last commit, empty outside a repository."""
+    command = ["git", "diff", "HEAD"]
+    try:
+        done = subprocess.run(command, cwd=data_root(), capture_output=True, text=True, timeout=10, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return ""
+    return done.stdout
+
+
+def open_run(run_dir: Path, overrides: list[str]) -> ExperimentCfg:
+    """The configuration of an existing run with overrides on top.
 
     Raises:
         CheckpointError: the folder is no run.
@@ -84,29 +110,4 @@ def open_run(run_dir: Path, overrides: list[str]) -> tuple[ExperimentCfg, list[s
     path = run_dir / CONFIG
     if not path.is_file():
         raise CheckpointError(f"{run_dir}: not a run directory: it has no {CONFIG}.")
-    saved = load_experiment(str(path))
-    cfg = load_experiment(str(path), overrides)
-    return cfg, differences(saved, cfg)
-
-
-def check_drift(run_dir: Path, changes: list[str], record: dict[str, Any], allow: bool) -> None:
-    """Refuse to resume a run under other conditions, or, if allowed, mark it as drifted.
-
-    Raises:
-        CheckpointError: something changed; lists it.
-    """
-    try:
-        saved = json.loads((run_dir / PROVENANCE).read_text(encoding="utf-8"))
-        changes = changes + drift(saved, record)
-    except (OSError, ValueError, KeyError, AttributeError, TypeError) as error:
-        changes = [*changes, f"{PROVENANCE} is damaged or missing ({error})"]
-    if not changes:
-        return
-    if not allow:
-        listed = "\n  ".join(changes)
-        raise CheckpointError(
-            f"{run_dir}: this is no longer the run that was started, so it would not go on bit for bit:\n  {listed}\n"
-            "Undo the change, or go on with --allow-drift, which marks the run."
-        )
-    with (run_dir / "drift.jsonl").open("a", encoding="utf-8") as file:
-        file.write(json.dumps({"resumed": record["created"], "changes": changes}) + "\n")
+    return load_experiment(str(path), overrides)

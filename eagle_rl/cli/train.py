@@ -4,18 +4,30 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from eagle_rl.config.compose import known_names
-from eagle_rl.config.load import config_hash, load_experiment, to_yaml
+from eagle_rl.config.load import load_experiment, to_yaml
 from eagle_rl.config.schema import ExperimentCfg
 from eagle_rl.errors import ConfigError
+from eagle_rl.runners.plan import plan_stages
 from eagle_rl.runners.provenance import Provenance, content_hash, slot_table_hash
 
-from .provenance import provenance
-from .run_directory import check_drift, create_run, open_run
+from .run_directory import create_run, open_run
+
+if TYPE_CHECKING:
+    from eagle_rl.runners.team import Team
+
+LOG_WIDTH = 160
+"""Columns of tables where the output is not a terminal."""
+
+_NEXT = """
+Watch it       eagle play {run}
+Measure it     eagle evaluate {run}
+Curves         tensorboard --logdir {run}
+Go on          eagle train --resume {run}"""
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -40,46 +52,38 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-@dataclass(frozen=True)
-class _Request:
-    """What the command line asks for, checked."""
-
-    cfg: ExperimentCfg
-    changes: list[str]
-    """Keys on which a resumed run's configuration would change."""
-
-
-def _request(args: argparse.Namespace) -> _Request:
+def _configuration(args: argparse.Namespace) -> ExperimentCfg:
+    """The experiment the command line asks for, checked."""
     experiment = args.words[0] if args.words and "=" not in args.words[0] else None
     overrides = args.words[1 if experiment else 0 :]
     overrides += [f"seed={args.seed}"] if args.seed is not None else []
     overrides += [f"run.device={args.device}"] if args.device else []
-    if args.resume is not None:
-        if args.scale:
-            raise ConfigError("--scale: a run keeps the scale it was started with.")
-        cfg, changes = open_run(args.resume, overrides)
-        if experiment not in (None, cfg.name):
-            raise ConfigError(f"--resume {args.resume}: this is a run of {cfg.name!r}, not of {experiment!r}.")
-        return _Request(cfg, changes)
-    if experiment is None:
-        raise ConfigError(
-            f"name an experiment: {', '.join(known_names('experiment'))}; or continue one with --resume RUN."
-        )
-    return _Request(load_experiment(experiment, overrides, args.scale), [])
+    if args.resume is None:
+        if experiment is None:
+            known = ", ".join(known_names("experiment"))
+            raise ConfigError(f"name an experiment: {known}; or continue one with --resume RUN.")
+        return load_experiment(experiment, overrides, args.scale)
+    if args.scale:
+        raise ConfigError("--scale: a run keeps the scale it was started with.")
+    cfg = open_run(args.resume, overrides)
+    if experiment not in (None, cfg.name):
+        raise ConfigError(f"--resume {args.resume}: this is a run of {cfg.name!r}, not of {experiment!r}.")
+    return cfg
 
 
-def _record(cfg: ExperimentCfg) -> dict[str, Any]:
-    """Provenance of a run, after checking every robot's files."""
+def _provenance(cfg: ExperimentCfg) -> Provenance:
+    """What a run depends on, after checking every robot's files."""
     from envs.robots.load import load_robot
+    from envs.robots.slots import SLOT_NAMES
 
     specs = [load_robot(name) for name in cfg.robots]
-    return provenance(cfg.seed, {s.name: (s.yaml_path, s.urdf_path) for s in specs}, config_hash(cfg))
+    robots = {s.name: content_hash([p.read_text(encoding="utf-8") for p in (s.yaml_path, s.urdf_path)]) for s in specs}
+    return Provenance(config=asdict(cfg), robots=robots, slot_table_hash=slot_table_hash(SLOT_NAMES))
 
 
-def _prepare_torch(cfg: ExperimentCfg) -> None:
+def _check_device(cfg: ExperimentCfg) -> None:
     import torch
 
-    torch.set_num_threads(cfg.run.torch_threads)
     if cfg.run.device != "cpu" and not torch.cuda.is_available():
         raise ConfigError(f"run.device: {cfg.run.device} is not available here: torch finds no CUDA device. Use cpu.")
 
@@ -87,38 +91,36 @@ def _prepare_torch(cfg: ExperimentCfg) -> None:
 def main(argv: Sequence[str]) -> int:
     """Run ``eagle train``."""
     args = _parser().parse_intermixed_args(argv)
-    request = _request(args)
-    cfg = request.cfg
+    cfg = _configuration(args)
     if args.show:
         print(to_yaml(cfg), end="")
         return 0
-    record = _record(cfg)
-    if args.resume is not None:
-        check_drift(args.resume, request.changes, record, args.allow_drift)
-    _prepare_torch(cfg)
-    run_dir = args.resume or create_run(cfg, args.out, record)
-    return _train(cfg, run_dir, args, record)
+    provenance = _provenance(cfg)
+    _check_device(cfg)
+
+    from eagle_rl.runners.team import Team
+
+    team = Team(cfg.run.device)
+    run_dir = args.resume or team.agree(lambda: create_run(cfg, args.out, provenance))
+    _train(cfg, run_dir, args, provenance, team)
+    return 0
 
 
-def _identity(record: dict[str, Any]) -> Provenance:
-    """What checkpoints of the run belong to."""
-    from envs.robots.slots import SLOT_NAMES
-
-    robots = {name: content_hash(files) for name, files in record["robots"].items()}
-    return Provenance(robots=robots, slot_table_hash=slot_table_hash(SLOT_NAMES))
-
-
-def _train(cfg: ExperimentCfg, run_dir: Path, args: argparse.Namespace, record: dict[str, Any]) -> int:
+def _train(cfg: ExperimentCfg, run_dir: Path, args: argparse.Namespace, provenance: Provenance, team: Team) -> None:
     from rich.console import Console
 
+    from eagle_rl.runners.judged import judged_results
     from eagle_rl.runners.stages import run_experiment
 
     from .environment import make_env_factory
     from .mdp_summary import print_mdp
+    from .tracking import print_tracking
 
-    console = Console()
+    console = Console(quiet=not team.leads)
+    if not console.is_terminal:
+        console.width = max(console.width, LOG_WIDTH)
     print_mdp(cfg.task, console)
-    console.print(f"{cfg.name}: {cfg.description}\nrun directory: {run_dir}", highlight=False)
+    console.print(f"{cfg.name}: {cfg.description}\nrun directory: {run_dir}\n", highlight=False)
     run_experiment(
         cfg,
         run_dir,
@@ -126,12 +128,9 @@ def _train(cfg: ExperimentCfg, run_dir: Path, args: argparse.Namespace, record: 
         resume=args.resume is not None,
         jobs=args.jobs,
         console=console,
-        provenance=_identity(record),
+        provenance=provenance,
         allow_drift=args.allow_drift,
+        team=team,
     )
-    console.print(
-        f"\nWatch it:     eagle play {run_dir}\nMeasure it:   eagle evaluate {run_dir}\n"
-        f"Curves:       tensorboard --logdir {run_dir}\nGo on:        eagle train --resume {run_dir}",
-        highlight=False,
-    )
-    return 0
+    print_tracking(judged_results(run_dir, plan_stages(cfg)), console)
+    console.print(_NEXT.format(run=run_dir), highlight=False)

@@ -23,14 +23,20 @@ def known_names(kind: str) -> list[str]:
     return sorted(path.stem for path in (data_root() / "cfg" / kind).glob("*.yaml"))
 
 
-def find_file(kind: str, name: str, where: str = "command line") -> Path:
-    """The file of a name in ``cfg/<kind>``, or the path itself if ``name`` is one.
+def find_file(kind: str, name: str, where: str = "command line", folder: Path = Path()) -> Path:
+    """The file of a name in ``cfg/<kind>``, or of a path if ``name`` is one.
+
+    Args:
+        kind: folder under ``cfg``.
+        name: name without ending, or path ending in ``.yaml``.
+        where: place the name was written, for messages.
+        folder: what a relative path starts from.
 
     Raises:
         ConfigError: there is no such file.
     """
     if name.endswith((".yaml", ".yml")):
-        return Path(name)
+        return folder / name
     known = known_names(kind)
     if name not in known:
         raise ConfigError(f"{where}: no {kind} named {name!r}.{did_you_mean(name, known)} Known: {', '.join(known)}.")
@@ -65,7 +71,7 @@ def load_file(kind: str, path: Path, seen: tuple[Path, ...] = ()) -> Node:
     base = node.children.pop("base", None)
     if base is None:
         return layer(Node({}, node.where), node) if kind == "experiment" else node
-    parent = load_file(kind, find_file(kind, _base_name(base), base.where), (*seen, path))
+    parent = load_file(kind, find_file(kind, _base_name(base), base.where, path.parent), (*seen, path))
     if kind != "experiment":
         return merge(parent, node)
     inherited = {key: value for key, value in parent.children.items() if key not in _NOT_INHERITED}

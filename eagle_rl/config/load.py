@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -95,20 +94,3 @@ def _plain(value: Any) -> Any:
 def to_yaml(cfg: ExperimentCfg) -> str:
     """The resolved configuration: every value, readable again by ``load_experiment``."""
     return write_yaml(_plain(cfg))
-
-
-def config_hash(cfg: ExperimentCfg) -> str:
-    """SHA-256 of the resolved values, independent of how files were written."""
-    canonical = json.dumps(_plain(cfg), sort_keys=True, separators=(",", ":"))
-    return hashlib.sha256(canonical.encode()).hexdigest()
-
-
-def differences(old: ExperimentCfg, new: ExperimentCfg) -> list[str]:
-    """Every key on which two configurations differ, as ``key: old -> new``."""
-    return _compare(_plain(old), _plain(new), "")
-
-
-def _compare(old: Any, new: Any, path: str) -> list[str]:
-    if isinstance(old, dict):
-        return [line for key in old for line in _compare(old[key], new[key], f"{path}.{key}" if path else key)]
-    return [] if old == new else [f"{path}: {old} -> {new}"]

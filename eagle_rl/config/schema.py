@@ -319,7 +319,7 @@ class AidsCfg:
     min_episode_ratio: float = 0.6
     """The harness decays while the mean episode lasts this share of its full length."""
     harness_contact_match: float = 0.7
-    """... and while foot contacts match the clock this often: dropped earlier, robots stand and never step (measured)."""
+    """... and while foot contacts match the clock this often; dropped earlier, robots stand and never step."""
     min_contact_match: float = 0.8
     """Gait shaping decays while foot contacts match the clock this often."""
 

@@ -25,7 +25,7 @@ _OPEN_SHARE: _Bound = ("above 0 and below 1", lambda x: 0 < x < 1)
 
 _WEIGHTS = "task.rewards.weights."
 
-_BOUNDS: dict[str, _Bound] = dict.fromkeys(
+BOUNDS: dict[str, _Bound] = dict.fromkeys(
     """
     num_envs task.sim.physics_dt task.sim.decimation task.sim.solver_iterations task.sim.solver_ls_iterations
     task.terrain.num_levels task.terrain.patch_size task.terrain.cell_size
@@ -45,26 +45,46 @@ _BOUNDS: dict[str, _Bound] = dict.fromkeys(
     """.split(),
     _POSITIVE,
 )
-_BOUNDS |= dict.fromkeys(
+BOUNDS |= dict.fromkeys(
     """
     task.commands.standing_probability task.commands.curriculum.weight_step
     task.commands.curriculum.lin_vel_threshold task.commands.curriculum.ang_vel_threshold
     task.commands.curriculum.contact_force_threshold task.commands.curriculum.contact_vel_threshold
     task.gait.phase_offset task.aids.harness_decay task.aids.gait_shaping_decay
-    task.aids.min_episode_ratio task.aids.min_contact_match algo.lam plan.tolerance
+    task.aids.min_episode_ratio task.aids.min_contact_match task.aids.harness_contact_match task.control.upper_ratio
+    algo.lam plan.tolerance
     """.split(),
     _SHARE,
 )
-_BOUNDS |= dict.fromkeys(
+BOUNDS |= dict.fromkeys(
     """
     task.control.min_effort_ratio task.control.min_effort_ratio_leg_pitch task.rewards.soft_limit_ratio
     task.rewards.penalty_initial task.rewards.penalty_exponent algo.mirror_fraction algo.gamma
     """.split(),
     _POSITIVE_SHARE,
 )
-_BOUNDS["task.gait.stance_ratio"] = _OPEN_SHARE
-_SIGNED = {"seed", "evaluation.seed"}
-_POSITIVE_ITEMS = {f"algo.network.{part}_dims" for part in ("encoder", "estimator", "actor", "critic")} | {
+BOUNDS["task.gait.stance_ratio"] = _OPEN_SHARE
+
+CEILINGS: dict[str, float] = {
+    "num_envs": 1e6,
+    "evaluation.num_envs_per_robot": 1e6,
+    "plan.judge_envs_per_robot": 1e6,
+    "task.observations.history_length": 1e3,
+    "task.terrain.num_levels": 1e3,
+    "task.commands.curriculum.num_bins_lin_vel_x": 1e3,
+    "task.commands.curriculum.num_bins_ang_vel_z": 1e3,
+    "algo.num_steps_per_env": 1e5,
+    "algo.network.embedding_dim": 1e5,
+    "run.num_threads": 1e4,
+    "run.torch_threads": 1e4,
+    "seed": 2**31 - 1,
+    "evaluation.seed": 2**31 - 1,
+}
+"""Counts that are memory or threads: a slip of the finger is refused before it takes the machine down. Seeds."""
+
+_MAX_ITEM = 1e5
+"""Bound on any number in a list: widths, points, ranges."""
+POSITIVE_ITEMS = {f"algo.network.{part}_dims" for part in ("encoder", "estimator", "actor", "critic")} | {
     "algo.network.std_range",
     "algo.learning_rate_range",
     "task.observations.scales.command",
@@ -87,21 +107,21 @@ def _is_number(value: Any) -> bool:
 
 
 def _scalar_fault(path: str, value: float, default: float) -> str | None:
-    if path in _SIGNED:
-        return None
     if path.startswith(_WEIGHTS):
         sign = "0 or more, it is a reward" if default > 0 else "0 or less, it is a penalty"
         return None if value * default >= 0 else f"got {value!r}, expected {sign}"
-    words, holds = _BOUNDS.get(path, _NOT_NEGATIVE)
+    if value > CEILINGS.get(path, math.inf):
+        return f"got {value!r}, expected at most {CEILINGS[path]:g}"
+    words, holds = BOUNDS.get(path, _NOT_NEGATIVE)
     return None if holds(value) else f"got {value!r}, expected {words}"
 
 
 def _sequence_fault(path: str, value: tuple[Any, ...]) -> str | None:
     if any(isinstance(v, str) for v in value):
         return None
-    if not all(math.isfinite(v) for v in value):
-        return f"got {list(value)}, expected finite numbers"
-    if (path in _POSITIVE_ITEMS or _POSITIVE_RANGES.match(path)) and min(value, default=1) <= 0:
+    if not all(abs(v) <= _MAX_ITEM for v in value):
+        return f"got {list(value)}, expected finite numbers of at most {_MAX_ITEM:g}"
+    if (path in POSITIVE_ITEMS or _POSITIVE_RANGES.match(path)) and min(value, default=1) <= 0:
         return f"got {list(value)}, expected numbers above 0"
     if len(value) == 2 and not path.endswith("_dims") and value[0] > value[1]:
         return f"got {list(value)}, expected the lower bound first"

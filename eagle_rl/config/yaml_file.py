@@ -30,6 +30,8 @@ class Node:
     """``file:line`` or ``command line``."""
     children: dict[str, Node] = field(init=False)
     """The value if it is a mapping, otherwise empty."""
+    items: list[Node] = field(default_factory=list)
+    """The entries with their places if the value is a list, otherwise empty."""
 
     def __post_init__(self) -> None:
         """Expose a mapping's entries without the reader having to test for one."""
@@ -79,6 +81,9 @@ def _line(node: yaml.Node, source: str, single_line: bool) -> str:
 
 def _convert(loader: _StrictLoader, node: yaml.Node, source: str, single_line: bool) -> Node:
     where = _line(node, source, single_line)
+    if isinstance(node, yaml.SequenceNode):
+        items = [_convert(loader, item, source, single_line) for item in node.value]
+        return Node(loader.construct_object(node, deep=True), where, items)
     if not isinstance(node, yaml.MappingNode):
         return Node(loader.construct_object(node, deep=True), where)
     entries: dict[str, Node] = {}
@@ -122,6 +127,20 @@ def read_yaml(path: Path) -> Node:
     Raises:
         ConfigError: the file cannot be read, is too large, or is not such YAML.
     """
+    node = parse_yaml(read_text(path), shown(path))
+    if not isinstance(node.value, dict):
+        raise ConfigError(
+            f"{shown(path)}: expected keys and values at the top level, got {type(node.value).__name__}."
+        )
+    return node
+
+
+def read_text(path: Path) -> str:
+    """The text of a configuration file.
+
+    Raises:
+        ConfigError: the file cannot be read, is too large, or is not UTF-8.
+    """
     source = shown(path)
     try:
         with path.open("rb") as file:
@@ -133,10 +152,7 @@ def read_yaml(path: Path) -> Node:
         raise ConfigError(f"{source}: not UTF-8 text (byte {error.start}).") from error
     if len(raw) > MAX_BYTES:
         raise ConfigError(f"{source}: larger than {MAX_BYTES} bytes; a configuration file is not.")
-    node = parse_yaml(text, source)
-    if not isinstance(node.value, dict):
-        raise ConfigError(f"{source}: expected keys and values at the top level, got {type(node.value).__name__}.")
-    return node
+    return text
 
 
 def write_yaml(value: Any) -> str:

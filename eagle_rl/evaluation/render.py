@@ -56,7 +56,10 @@ def to_markdown(table: Table) -> str:
         cells = [row.robot, row.method, *errors, _percent(row.survival), str(len(row.seeds) or "-")]
         lines.append("| " + " | ".join(cells) + " |")
     hashes = [f"- {method}: {', '.join(h[:12] for h in hashes)}" for method, hashes in table.checkpoints.items()]
-    note = "Bold: the lowest of a robot's judged methods. In brackets: the paper's number. ± is the standard deviation over training seeds."
+    note = (
+        "Bold: the lowest of a robot's judged methods. In brackets: the paper's number. "
+        "± is the standard deviation over training seeds."
+    )
     return "\n".join([*lines, "", table.caption, note, "", "Checkpoints (sha256):", "", *hashes, ""])
 
 

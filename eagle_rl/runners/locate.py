@@ -6,6 +6,7 @@ from pathlib import Path
 
 from eagle_rl.errors import CheckpointError
 from eagle_rl.runners.checkpoint import latest_checkpoint
+from eagle_rl.runners.published import SUFFIX
 from eagle_rl.runners.records import read_plan, stage_dir
 
 
@@ -13,14 +14,14 @@ def find_checkpoint(path: Path) -> Path:
     """The checkpoint meant by a path.
 
     Args:
-        path: a checkpoint's data file or manifest; a ``checkpoints`` folder or the folder of a stage, whose latest is
-            meant; or a run directory, whose most advanced generalist is.
+        path: a checkpoint's data file or manifest, or a published policy; a ``checkpoints`` folder or the folder of a
+            stage, whose latest checkpoint is meant; or a run directory, whose most advanced generalist is.
 
     Raises:
         CheckpointError: there is none.
     """
-    if path.suffix in (".pt", ".json"):
-        return path.with_suffix(".pt")
+    if path.suffix in (".pt", ".json", SUFFIX):
+        return path if path.suffix == SUFFIX else path.with_suffix(".pt")
     folders = [path, path / "checkpoints"]
     if (path / "plan.json").exists():
         generalists = [stage.name for stage in read_plan(path) if stage.kind != "specialist"]

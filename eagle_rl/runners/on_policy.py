@@ -26,6 +26,7 @@ from eagle_rl.runners.health import require_finite
 from eagle_rl.runners.interrupt import InterruptGuard
 from eagle_rl.runners.progress import ProgressReport
 from eagle_rl.runners.provenance import Provenance
+from eagle_rl.runners.team import join_processes
 from eagle_rl.runners.training_log import TrainingLog
 
 
@@ -318,11 +319,7 @@ class EagleRunner(OnPolicyRunner):
         return bool(votes > 0)
 
     def _configure_multi_gpu(self) -> None:
-        """Join the processes torchrun started: nccl where each has a GPU of its own, else gloo, which can share one.
-
-        rsl_rl itself refuses the CPU. Several processes on one GPU pay where the physics is the cost: while one learns
-        or waits for the GPU, another's physics has the cores.
-        """
+        """Join the processes torchrun started, on the CPU too, which rsl_rl itself refuses."""
         self.gpu_world_size = int(os.getenv("WORLD_SIZE", "1"))
         self.gpu_global_rank = int(os.getenv("RANK", "0"))
         self.gpu_local_rank = int(os.getenv("LOCAL_RANK", "0"))
@@ -338,6 +335,4 @@ class EagleRunner(OnPolicyRunner):
         on_gpu = str(self.device).startswith("cuda")
         if on_gpu:
             torch.cuda.set_device(torch.device(self.device).index or 0)
-        if not torch.distributed.is_initialized():
-            own_gpu = on_gpu and torch.cuda.device_count() >= int(os.getenv("LOCAL_WORLD_SIZE", "1"))
-            torch.distributed.init_process_group("nccl" if own_gpu else "gloo")
+        join_processes(self.device)

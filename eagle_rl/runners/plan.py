@@ -59,17 +59,12 @@ def warm_task(task: TaskCfg) -> TaskCfg:
     )
 
 
-def iteration_steps(cfg: ExperimentCfg) -> int:
-    """Environment steps of one learning iteration."""
-    return cfg.num_envs * cfg.algo.num_steps_per_env
-
-
 def _stage(cfg: ExperimentCfg, name: str, kind: Kind, env_steps: int, **rest: object) -> Stage:
     """A stage with its budget in iterations and a seed of its own."""
     fields = {
         "round": 0,
         "robots": cfg.robots,
-        "iterations": -(-env_steps // iteration_steps(cfg)),
+        "iterations": -(-env_steps // (cfg.num_envs * cfg.algo.num_steps_per_env)),
         "seed": zlib.crc32(f"{cfg.seed}/{name}".encode()) >> 1,
     }
     return Stage(name=name, kind=kind, env_steps=env_steps, **{**fields, **rest})  # type: ignore[arg-type]
@@ -103,8 +98,12 @@ def _round(cfg: ExperimentCfg, number: int, generalist: str) -> list[Stage]:
     return [*specialists, distill]
 
 
-def plan_stages(cfg: ExperimentCfg) -> list[Stage]:
-    """Every stage the experiment may run, in order; rounds after convergence are left out while running."""
+def plan_stages(cfg: ExperimentCfg, processes: int = 1) -> list[Stage]:
+    """Every stage the experiment may run, in order; rounds after convergence are left out while running.
+
+    With several data-parallel ``processes``, each of which has all of ``num_envs``, budgets take fewer iterations.
+    """
+    cfg = replace(cfg, num_envs=cfg.num_envs * processes)
     plan = cfg.plan
     if plan.method == "compass":
         raise ConfigError("plan.method: compass is not built; choose ppo, eagle or kickstarting.")

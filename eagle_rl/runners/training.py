@@ -38,7 +38,9 @@ class Job:
     make_env: MakeEnv
     provenance: Provenance
     check_claim: Callable[[], None]
-    """Raises once another process has taken the stage over."""
+    """Raises once another worker has taken the stage over."""
+    rank: int = 0
+    """Among the data-parallel processes."""
     allow_drift: bool = False
 
 
@@ -69,7 +71,7 @@ def train(job: Job) -> Path:
 def _make_runner(job: Job) -> EagleRunner:
     """The runner of a stage, its specialists loaded."""
     cfg, stage = job.cfg, job.stage
-    env: VecEnv = job.make_env(stage.robots, cfg.num_envs, cfg.task, stage.seed)
+    env: VecEnv = job.make_env(stage.robots, cfg.num_envs, cfg.task, stage.seed + job.rank)
     history = cfg.task.observations.history_length
     train_cfg = make_train_cfg(cfg.algo, cfg.run, history_length=history, seed=stage.seed)
     runner = EagleRunner(env, train_cfg, job.folder, cfg.run.device, job.provenance)

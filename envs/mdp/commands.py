@@ -169,9 +169,9 @@ class CommandSampler:
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Restore what :meth:`state_dict` returned."""
         self.weights = state["weights"].to(self.weights)
-        self._bin = state["bin"].to(self._bin)
-        self._creditable = state["creditable"].to(self._creditable)
-        self._sums = state["sums"].to(self._sums)
+        self._bin = state["bin"].to(self._bin, copy=True)
+        self._creditable = state["creditable"].to(self._creditable, copy=True)
+        self._sums = state["sums"].to(self._sums, copy=True)
 
     def log(self) -> dict[str, float]:
         """Share of the grid that is open, over all robots and for the slowest one, and how heavy it is."""

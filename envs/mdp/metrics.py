@@ -8,18 +8,18 @@ from torch import Tensor
 from eagle_rl.config.schema import CommandsCfg, GaitCfg, Range
 
 from ..state import PooledRobots, PooledState
-from .gait import contact_probability
+from .gait import homogenise
 
 ERROR_NAMES = ("lin_vel_x", "lin_vel_y", "ang_vel_z", "base_height", "body_pitch")
 """Columns of every array of tracking errors: E_vx, E_vy, E_omega, E_h, E_p; also the fields of ``CommandsCfg``."""
 
 
-def tracking_errors(state: PooledState, robots: PooledRobots) -> Tensor:
-    """Absolute error of each command, shape (N, 5): [m/s], [m/s], [rad/s], [m], [rad] (paper, Tab. main).
+def measured_commands(state: PooledState, robots: PooledRobots) -> Tensor:
+    """What each command asks for, as it is, shape (N, 5): [m/s], [m/s], [rad/s], [m], [rad].
 
     Velocities are true ones in the base frame, height and pitch those of the root (HugWBC 10, 11.5).
     """
-    measured = torch.stack(
+    return torch.stack(
         (
             state.base_lin_vel_b[:, 0],
             state.base_lin_vel_b[:, 1],
@@ -29,12 +29,16 @@ def tracking_errors(state: PooledState, robots: PooledRobots) -> Tensor:
         ),
         dim=1,
     )
-    return (state.command - measured).abs()
+
+
+def tracking_errors(state: PooledState, robots: PooledRobots) -> Tensor:
+    """Absolute error of each command, shape (N, 5): [m/s], [m/s], [rad/s], [m], [rad] (paper, Tab. main)."""
+    return (state.command - measured_commands(state, robots)).abs()
 
 
 def contact_match(state: PooledState, cfg: GaitCfg) -> Tensor:
-    """Share of the feet whose contact agrees with the clock (C > 0.5), shape (N,)."""
-    desired = contact_probability(state.foot_phase, cfg) > 0.5
+    """Share of the feet whose contact agrees with the clock (stance, where C > 0.5), shape (N,)."""
+    desired = homogenise(state.foot_phase, cfg.stance_ratio) < 0.5
     return (desired == state.foot_contact).to(state.foot_phase.dtype).mean(dim=1)
 
 

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
-from eagle_rl.errors import RobotError, did_you_mean
+from eagle_rl.config.yaml_file import read_yaml, to_plain
+from eagle_rl.errors import ConfigError, RobotError, did_you_mean
 from eagle_rl.paths import data_root
 
 from .slots import MIRROR_PERMUTATION, MIRROR_SIGN, SLOT_INDEX, SLOT_NAMES
 from .spec import COLLISION_LINKS, FALL_LINKS, FEET, Array, RobotSpec
 from .tree import Tree
-from .urdf import MAX_FILE_BYTES, MAX_VALUE, as_sentence, read_urdf
+from .urdf import MAX_VALUE, as_sentence, read_urdf
 
 ROLES = tuple(dict.fromkeys((*FALL_LINKS, "left_foot", "right_foot", "left_hand", "right_hand", *COLLISION_LINKS)))
 """Every role a robot's links must fill."""
@@ -76,35 +76,11 @@ def _yaml_path(name_or_path: str | Path) -> Path:
     return data_root() / "cfg" / "robots" / f"{name_or_path}.yaml"
 
 
-class _StrictLoader(yaml.SafeLoader):
-    """YAML without duplicate keys, which would silently win over each other, and without aliases."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
-        count = len(node.value)
-        mapping = super().construct_mapping(node, deep)
-        if len(mapping) != count:
-            raise yaml.constructor.ConstructorError(None, None, "a key appears twice in this mapping", node.start_mark)
-        return mapping
-
-    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
-        if self.check_event(yaml.AliasEvent):
-            raise yaml.composer.ComposerError(None, None, "aliases are not allowed", None)
-        return super().compose_node(parent, index)
-
-
 def _read_yaml(path: Path) -> dict[str, Any]:
     try:
-        if path.stat().st_size > MAX_FILE_BYTES:
-            raise RobotError(f"Robot file {path} is larger than {MAX_FILE_BYTES} bytes.")
-        data = yaml.load(path.read_text(encoding="utf-8"), Loader=_StrictLoader)
-    except OSError as error:
-        raise RobotError(f"Robot file {path} cannot be read: {error.strerror}.") from error
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        if isinstance(error, RobotError):
-            raise
-        raise RobotError(f"Robot file {path} is not valid YAML: {error}") from error
-    if not isinstance(data, dict):
-        raise RobotError(f"Robot file {path} holds a {type(data).__name__}, expected a mapping with {REQUIRED}.")
+        data: dict[str, Any] = to_plain(read_yaml(path))
+    except ConfigError as error:
+        raise RobotError(f"Robot file {error}") from error
     return data
 
 

@@ -10,9 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from eagle_rl.config import validate
 from eagle_rl.config.compose import known_names
-from eagle_rl.config.load import config_hash, differences, load_experiment, to_yaml
+from eagle_rl.config.load import load_experiment, to_yaml
 from eagle_rl.config.schema import ExperimentCfg, RewardWeightsCfg
+from eagle_rl.config.validate import leaves
 from eagle_rl.errors import ConfigError, RobotError
 
 EXPERIMENTS = known_names("experiment")
@@ -42,7 +44,6 @@ def test_a_resolved_experiment_reads_back_as_itself(name):
     cfg = load_experiment(name)
     again = load_experiment(write(to_yaml(cfg)))
     assert again == cfg
-    assert config_hash(again) == config_hash(cfg)
 
 
 def test_a_whole_configuration_is_written_down_in_the_resolved_file():
@@ -58,8 +59,9 @@ def test_the_papers_task_is_the_printed_table_without_aids():
 
 
 def test_without_embodiment_observation_differs_from_ppo_in_that_alone():
-    changes = differences(load_experiment("ppo"), load_experiment("ppo_no_eo"))
-    assert [c.split(":")[0] for c in changes] == ["name", "description", "task.observations.embodiment_observation"]
+    ppo, without = (dict(leaves(load_experiment(name))) for name in ("ppo", "ppo_no_eo"))
+    changed = {key for key in ppo if ppo[key] != without[key]}
+    assert changed == {"name", "description", "task.observations.embodiment_observation"}
 
 
 def test_scale_paper_has_4096_environments_and_hugwbcs_ppo():
@@ -87,6 +89,13 @@ def test_naming_a_task_starts_it_afresh_and_its_own_keys_come_on_top():
     assert task.rewards.orientation == "upright"
     assert task.gait.frequency == 2.0
     assert isinstance(task.gait.frequency, float)
+
+
+def test_a_base_given_as_a_path_is_looked_for_beside_its_file():
+    Path("mine").mkdir()
+    Path("mine/first.yaml").write_text("base: ppo\nseed: 7\n", encoding="utf-8")
+    Path("mine/second.yaml").write_text("base: first.yaml\n", encoding="utf-8")
+    assert load_experiment("mine/second.yaml").seed == 7
 
 
 def test_a_path_names_the_experiment_after_its_file():
@@ -136,6 +145,10 @@ def test_a_wrong_override_is_named_with_what_was_expected(override, expected):
         ("task.rewards.weights.alive=-1", "expected 0 or more, it is a reward"),
         ("task.gait.frequency=.nan", "got nan, expected a finite number"),
         ("task.randomization.motor_offset=[-.inf, 0]", "expected finite numbers"),
+        ("task.randomization.motor_offset=[0, .nan]", "expected finite numbers"),
+        ("num_envs=1000000000000", "expected at most 1e+06"),
+        ("seed=-1", "expected 0 or more"),
+        ("algo.network.actor_dims=[1000000000]", "of at most 100000"),
         ("algo.num_mini_batches=7", "7 does not divide the batch of num_envs 320 x num_steps_per_env 24 = 7680"),
         ("algo.learning_rate=0.1", "0.1 is outside learning_rate_range [1e-05, 0.002]"),
         ("algo.network.init_std=2", "2 is outside std_range [0.1, 1.2]"),
@@ -153,6 +166,11 @@ def test_an_impossible_value_is_named_with_its_bound(override, expected):
     faults = faults_of(override)
     assert all(f.startswith("command line: ") for f in faults)
     assert any(expected in fault for fault in faults), faults
+
+
+def test_every_bound_is_that_of_a_key():
+    keys = {key for key, _ in leaves(ExperimentCfg(name="x"))}
+    assert {*validate.BOUNDS, *validate.CEILINGS, *validate.POSITIVE_ITEMS} <= keys
 
 
 def test_a_default_that_clashes_with_a_value_is_reported_where_the_value_was_written():
@@ -227,7 +245,7 @@ ordered = st.lists(st.floats(-5, 5), min_size=2, max_size=2).map(sorted).map(tup
 
 
 @given(
-    seed=st.integers(0, 2**31),
+    seed=st.integers(0, 2**31 - 1),
     num_envs=st.integers(5, 10_000).map(lambda n: 4 * n),
     gamma=share,
     frequency=positive,

@@ -37,16 +37,43 @@ def tilted(roll: float = 0.0, pitch: float = 0.0, yaw: float = 0.0) -> PooledSta
     )
 
 
-def test_aids_decay_only_while_their_own_condition_holds() -> None:
+def settled(episode_ratio: list[float], match: list[float]) -> LearningAids:
+    """Aids after more updates than their running means remember."""
+    aids = LearningAids(AidsCfg(), len(match))
+    for _ in range(100):
+        aids.update(torch.tensor(episode_ratio), torch.tensor(match))
+    return aids
+
+
+def test_harness_decays_only_while_episodes_are_long_and_feet_follow_the_clock() -> None:
+    episode_ratio, match = [0.9, 0.9, 0.3], [0.75, 0.65, 0.9]
+    aids = settled(episode_ratio, match)
+    before = aids.harness.clone()
+    aids.update(torch.tensor(episode_ratio), torch.tensor(match))
+    assert (aids.harness / before).tolist() == pytest.approx([0.98, 1.0, 1.0])
+    assert aids.harness[1:].tolist() == [1.0, 1.0], "never fulfilled"
+    assert aids.log(["a", "b", "c"])["Curriculum/harness/a"] == aids.harness[0].item()
+
+
+def test_gait_shaping_stays_until_its_robots_harness_is_exactly_zero() -> None:
     aids = LearningAids(AidsCfg(), 2)
-    for _ in range(100):  # longer than the running means remember
-        aids.update(torch.tensor([0.9, 0.3]), torch.tensor([0.5, 0.9]))
-    before = aids.harness.clone(), aids.gait_shaping.clone()
-    aids.update(torch.tensor([0.9, 0.3]), torch.tensor([0.5, 0.9]))
-    assert (aids.harness / before[0]).tolist() == pytest.approx([0.98, 1.0])
-    assert (aids.gait_shaping / before[1]).tolist() == pytest.approx([1.0, 0.98])
-    assert aids.harness[1] == aids.gait_shaping[0] == 1.0, "never fulfilled"
-    assert aids.log(["a", "b"])["Curriculum/harness/a"] == aids.harness[0].item()
+    while aids.harness[0] > 0.0:
+        assert aids.gait_shaping.tolist() == [1.0, 1.0]
+        aids.update(torch.tensor([1.0, 0.0]), GOOD)
+    for _ in range(10):
+        aids.update(torch.tensor([1.0, 0.0]), GOOD)
+    assert aids.gait_shaping[0] < 1.0
+    assert aids.gait_shaping[1] == 1.0, "its harness is still on"
+
+
+def test_gait_shaping_asks_for_better_contacts_than_the_harness() -> None:
+    cfg = AidsCfg(harness=0.0)
+    between = 0.5 * (cfg.harness_contact_match + cfg.min_contact_match)
+    aids = LearningAids(cfg, 2)
+    for _ in range(100):
+        aids.update(GOOD, torch.tensor([between, 1.0]))
+    assert aids.gait_shaping[0] == 1.0
+    assert aids.gait_shaping[1] < 1.0
 
 
 def test_one_lucky_interval_does_not_start_the_decay() -> None:
@@ -76,8 +103,11 @@ def test_aids_survive_saving() -> None:
     assert torch.equal(first.gait_shaping, second.gait_shaping)
 
 
-def test_a_robot_that_does_as_told_feels_nothing() -> None:
-    assert not harness_wrench(quiet_state(ROBOTS), ROBOTS, ONES).any()
+def test_a_robot_that_does_as_told_is_only_carried_by_the_constant_share() -> None:
+    force, torque = pull(quiet_state(ROBOTS))
+    assert torch.allclose(force[:, 2], 0.35 * WEIGHT)
+    assert not force[:, :2].any()
+    assert not torque.any()
 
 
 def test_scale_zero_is_exactly_zero_even_for_a_broken_state() -> None:
@@ -106,14 +136,14 @@ def test_torque_leads_to_the_commanded_pitch_and_is_capped() -> None:
     assert torch.allclose(pull(state)[1][:, 1], 120.0 / 33.0 * ROBOTS.total_mass)
 
 
-def test_support_lifts_by_at_most_half_the_weight_and_never_pulls_down() -> None:
+def test_support_grows_below_the_commanded_height_up_to_its_cap_and_never_pulls_down() -> None:
     state = quiet_state(ROBOTS)
     state.base_height = ROBOTS.nominal_height - 0.05
-    assert torch.allclose(pull(state)[0][:, 2], 50.0 * 0.05 * ROBOTS.total_mass)
+    assert torch.allclose(pull(state)[0][:, 2], 0.35 * WEIGHT + 30.0 * 0.05 * ROBOTS.total_mass)
     state.base_height = ROBOTS.nominal_height - 0.5
-    assert torch.allclose(pull(state)[0][:, 2], 0.5 * WEIGHT)
-    state.command[:, 3] = -0.6
-    assert not pull(state)[0].any(), "already above the commanded height"
+    assert torch.allclose(pull(state)[0][:, 2], 0.6 * WEIGHT)
+    state.command[:, 3] = -0.7
+    assert not pull(state)[0].any(), "far above the commanded height"
 
 
 @settings(max_examples=10, deadline=None)

@@ -175,7 +175,10 @@ def test_contact_force_counts_vertical_load_in_swing() -> None:
 
 def test_gait_shaping_widens_the_force_kernel() -> None:
     state = state_with(foot_phase=[0.25, 0.75], foot_force_w=torch.tensor([[0.0, 0, 200], [0.0, 0, 80]]))
-    assert value("contact_force", state, context(shaping=0.5)) == pytest.approx(1 - math.exp(-6400 / 5050), rel=1e-4)
+    loaded = REWARD_TERMS["contact_force"].function(state, ROBOTS, context(shaping=0.5))
+    for mass, error in zip(ROBOTS.total_mass.tolist(), loaded.tolist(), strict=True):
+        kappa = 50 + 5000 * (mass / 33.0) ** 2
+        assert error == pytest.approx(1 - math.exp(-6400 / kappa), rel=1e-4), f"robot of {mass} kg"
 
 
 def test_roll_pitch_rate() -> None:

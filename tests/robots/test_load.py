@@ -46,7 +46,7 @@ def test_unknown_name_suggests_the_nearest() -> None:
 
 
 def test_missing_files_are_named(tmp_path: Path) -> None:
-    with pytest.raises(RobotError, match=r"nowhere\.yaml cannot be read"):
+    with pytest.raises(RobotError, match=r"nowhere\.yaml: cannot be read"):
         load_robot(tmp_path / "nowhere.yaml")
     assert "lost.urdf cannot be read" in _refusal(tmp_path, data={**biped_data(), "urdf": "lost.urdf"})
 
@@ -123,12 +123,12 @@ def test_all_faults_are_listed_at_once(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("name: a\nname: b\n", "a key appears twice"),
-        ("a: &x [1]\nb: *x\n", "aliases are not allowed"),
-        ("- 1\n- 2\n", "holds a list"),
-        ("name: [", "is not valid YAML"),
-        ("!!python/object/apply:os.system ['true']", "is not valid YAML"),
-        ("[" * 5000, "is not valid YAML"),
+        ("name: a\nname: b\n", "key 'name' is given twice"),
+        ("a: &x [1]\nb: *x\n", r"aliases \(\*name\) are not allowed"),
+        ("- 1\n- 2\n", "got list"),
+        ("name: [", "robot.yaml:"),
+        ("!!python/object/apply:os.system ['true']", "are not allowed"),
+        ("[" * 5000, "nested deeper"),
     ],
 )
 def test_unsound_yaml_is_refused(tmp_path: Path, text: str, expected: str) -> None:

@@ -1,10 +1,8 @@
-"""A whole experiment on toy robots, small enough for a test; also the program that tests kill."""
+"""A whole experiment on toy robots, small enough for a test."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
-from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -19,7 +17,7 @@ from eagle_rl.config.schema import (
     RunCfg,
     TaskCfg,
 )
-from eagle_rl.runners.stages import RunResult, run_experiment
+from eagle_rl.runners.stages import RunResult
 from tests.toy import FRAMES, ToyEnv
 
 ENVS, STEPS = 12, 4
@@ -71,8 +69,3 @@ def toy_experiment(iterations: int = 3, judge_envs: int = 4, **plan: object) -> 
 def parameters(result: RunResult) -> dict[str, Tensor]:
     """Final weights of the generalist."""
     return torch.load(result.generalist, weights_only=True)["algorithm"]["actor_state_dict"]
-
-
-if __name__ == "__main__":
-    folder = Path(sys.argv[1])
-    run_experiment(toy_experiment(), folder, make_toy_env, resume=folder.exists())

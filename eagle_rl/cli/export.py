@@ -1,0 +1,114 @@
+"""``eagle export``: a checkpoint as one ONNX file with its input/output contract."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from eagle_rl._version import __version__
+from eagle_rl.errors import ConfigError
+
+if TYPE_CHECKING:
+    from eagle_rl.config.schema import ExperimentCfg
+    from eagle_rl.export.contract import Contract, RobotContract, Term
+    from envs.mdp.layout import ObservationTerm
+    from envs.robots.spec import Array, RobotSpec
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="eagle export",
+        description="Write a policy as one ONNX file that says itself how to be used.",
+        epilog="Try it without torch: eagle sim2sim FILE.onnx --robot g1",
+    )
+    parser.add_argument("checkpoint", type=Path, metavar="CKPT", help="checkpoint, stage or run")
+    parser.add_argument(
+        "--out", type=Path, metavar="FILE.onnx", help="[next to the checkpoint, with the contract's hash in its name]"
+    )
+    return parser
+
+
+def build_contract(cfg: ExperimentCfg, checkpoint: str, robots: Sequence[str]) -> Contract:
+    """The contract of a policy.
+
+    Args:
+        cfg: the experiment it comes from.
+        checkpoint: sha256 of its checkpoint.
+        robots: robots it may drive.
+    """
+    from eagle_rl.export.contract import Contract
+    from envs.mdp.gait import STANDING_PHASE
+    from envs.mdp.layout import ObservationLayout
+    from envs.robots.load import load_robot
+    from envs.robots.slots import SLOT_NAMES
+
+    task = cfg.task
+    groups = ObservationLayout(task.observations).groups
+    history = groups["history"]
+    return Contract(
+        version=__version__,
+        checkpoint=checkpoint,
+        step_dt=task.sim.physics_dt * task.sim.decimation,
+        slots=SLOT_NAMES,
+        history_length=task.observations.history_length,
+        frame=tuple(_term(term) for term in history[: len(history) // task.observations.history_length]),
+        command=_term(groups["command"][0]),
+        observation_clip=task.observations.clip,
+        action_clip=task.control.action_clip,
+        gait_frequency=task.gait.frequency,
+        gait_phase_offset=task.gait.phase_offset,
+        standing_phase=STANDING_PHASE,
+        robots={name: _robot(load_robot(name), cfg) for name in robots},
+    )
+
+
+def _term(term: ObservationTerm) -> Term:
+    from eagle_rl.export.contract import Term
+
+    return Term(name=term.name, unit=term.unit, scale=term.scales)
+
+
+def _robot(spec: RobotSpec, cfg: ExperimentCfg) -> RobotContract:
+    from eagle_rl.export.contract import RobotContract
+    from envs.pooling import action_scale
+
+    def numbers(values: Array) -> tuple[float, ...]:
+        return tuple(values.tolist())
+
+    return RobotContract(
+        joints=spec.joint_names,
+        slots=tuple(spec.slots.tolist()),
+        signs=numbers(spec.signs),
+        zero_offsets=numbers(spec.zero_offsets),
+        default_joint_pos=numbers(spec.default_joint_pos),
+        action_scale=numbers(action_scale(spec, cfg.task.control)[spec.slots]),
+        stiffness=numbers(spec.stiffness),
+        damping=numbers(spec.damping),
+        effort_limit=numbers(spec.effort_limit),
+        nominal_height=spec.nominal_height,
+    )
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run ``eagle export``."""
+    args = _parser().parse_args(argv)
+    if args.out is not None and not args.out.absolute().parent.is_dir():
+        raise ConfigError(f"--out {args.out}: there is no folder {args.out.parent}. Make it first.")
+
+    from eagle_rl.config.load import experiment_from_plain
+    from eagle_rl.export.onnx import export_onnx
+    from eagle_rl.runners.checkpoint import load_actor
+    from eagle_rl.runners.locate import find_checkpoint
+    from eagle_rl.runners.provenance import slot_table_hash
+    from envs.robots.slots import SLOT_NAMES
+
+    checkpoint = find_checkpoint(args.checkpoint)
+    actor, manifest = load_actor(checkpoint, slot_table_hash=slot_table_hash(SLOT_NAMES))
+    cfg = experiment_from_plain(manifest["config"], str(checkpoint))
+    contract = build_contract(cfg, manifest["sha256"], cfg.robots)
+    out = args.out or checkpoint.with_name(f"{checkpoint.stem}_{contract.digest[:8]}.onnx")
+    difference = export_onnx(actor, contract, out)
+    print(f"{out}: {', '.join(contract.robots)}; differs from torch by at most {difference:.1g}")
+    return 0

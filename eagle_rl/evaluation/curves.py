@@ -1,0 +1,94 @@
+"""What a run's folder says about its course: learning curves and scores over rounds."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from eagle_rl.errors import ConfigError
+from eagle_rl.evaluation.evaluate import EvaluationResult
+
+LEARNING_TAGS = {
+    "reward per episode": "Train/mean_reward",
+    "episode length [steps]": "Train/mean_episode_length",
+    "$E_{v_x}$ [m/s]": "Metrics/E_vx",
+    "$E_{v_y}$ [m/s]": "Metrics/E_vy",
+    r"$E_\omega$ [rad/s]": "Metrics/E_omega",
+    "$E_h$ [m]": "Metrics/E_h",
+    "$E_p$ [rad]": "Metrics/E_p",
+    "$L_a$": "Distill/L_a",
+    "$L_e$": "Distill/L_e",
+}
+"""Panels of the learning curves; each tag is followed by a robot's name."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Curve:
+    """One quantity of one robot over a stage."""
+
+    robot: str
+    env_steps: tuple[int, ...]
+    """Environment steps of the stage, all robots."""
+    values: tuple[float, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RoundScores:
+    """Tracking errors of one robot under one policy of a run."""
+
+    robot: str
+    specialist: bool
+    position: float
+    """Round of a generalist, 0 before the first; specialists stand half a round before the generalist they teach."""
+    errors: tuple[float, ...]
+    """Charged errors in the order of the five commands."""
+
+
+def read_curves(metrics: Path, smoothing: int = 1) -> dict[str, list[Curve]]:
+    """The panels of LEARNING_TAGS for which a ``metrics.jsonl`` has numbers.
+
+    Args:
+        metrics: file with one JSON object per iteration.
+        smoothing: iterations averaged into one point.
+    """
+    if not metrics.exists():
+        raise ConfigError(f"{metrics}: no such file. Name a run or the folder of a stage that has begun to train.")
+    entries = [json.loads(line) for line in metrics.read_text(encoding="utf-8").splitlines() if line.endswith("}")]
+    panels = {title: list(_curves(entries, tag, smoothing)) for title, tag in LEARNING_TAGS.items()}
+    return {title: curves for title, curves in panels.items() if curves}
+
+
+def _curves(entries: Sequence[dict[str, float | str]], tag: str, smoothing: int) -> Iterator[Curve]:
+    """One curve per robot that has the tag."""
+    keys = dict.fromkeys(key for entry in entries for key in entry if key.startswith(f"{tag}/"))
+    for key in keys:
+        points = [
+            (int(e["Perf/env_steps"]), float(e[key])) for e in entries if key in e and math.isfinite(float(e[key]))
+        ]
+        windows = [points[i : i + smoothing] for i in range(0, len(points), smoothing)]
+        if windows:
+            yield Curve(
+                robot=key.removeprefix(f"{tag}/"),
+                env_steps=tuple(window[-1][0] for window in windows),
+                values=tuple(sum(value for _, value in window) / len(window) for window in windows),
+            )
+
+
+def read_rounds(stages: Sequence[tuple[int, bool, Path]]) -> list[RoundScores]:
+    """Scores of every judged stage of a run.
+
+    Args:
+        stages: round, whether it is a specialist, and the file of its result, for every judged stage.
+    """
+    scores = []
+    for number, specialist, path in stages:
+        for robot, metrics in EvaluationResult.read(path).robots.items():
+            errors = tuple(math.nan if e is None else e for e in metrics.subsets["all"].charged)
+            position = number - 0.5 if specialist else float(number)
+            scores.append(RoundScores(robot=robot, specialist=specialist, position=position, errors=errors))
+    if not scores:
+        raise ConfigError("No stage of the run has been judged: plan.judge_envs_per_robot is 0, or none is done yet.")
+    return scores

@@ -1,0 +1,147 @@
+"""Figures of the experiment section, as matplotlib figures that are readable in print."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure as Figure  # re-exported, so that only this module names matplotlib
+from numpy.typing import NDArray
+
+from eagle_rl.evaluation.curves import Curve, RoundScores
+from eagle_rl.evaluation.latents import Embeddings
+from eagle_rl.evaluation.metrics import RobotMetrics
+from eagle_rl.evaluation.reference import STAND_STILL
+from eagle_rl.evaluation.response import Response
+from eagle_rl.evaluation.robustness import Sweep
+
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+"""Distinguishable without colour vision (Okabe and Ito); with markers, also in grey."""
+MARKERS = "osDv^P*"
+ERRORS = ("$E_{v_x}$ [m/s]", "$E_{v_y}$ [m/s]", r"$E_\omega$ [rad/s]", "$E_h$ [m]", "$E_p$ [rad]")
+TRACES = ("$v_x$ [m/s]", "$v_y$ [m/s]", r"$\omega$ [rad/s]", "$h$ [m]", "$p$ [rad]")
+
+
+def _panels(rows: int, columns: int, width: float = 3.0, height: float = 2.4) -> tuple[Figure, NDArray[np.object_]]:
+    """A grid of axes with light grids and no boxes."""
+    figure = Figure(figsize=(width * columns, height * rows), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False)
+    for ax in axes.flat:
+        ax.grid(alpha=0.3)
+        ax.spines[["top", "right"]].set_visible(False)
+        ax.tick_params(labelsize=8)
+    return figure, axes
+
+
+def _legend(figure: Figure, ax: Axes, columns: int) -> None:
+    """One legend under all panels."""
+    handles, labels = ax.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False, fontsize=9)
+
+
+def save(figure: Figure, folder: Path, name: str) -> list[Path]:
+    """Write a figure as PNG and PDF; the paths."""
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = [folder / f"{name}.{suffix}" for suffix in ("png", "pdf")]
+    for path in paths:
+        figure.savefig(path, dpi=200)
+    return paths
+
+
+def learning_curves(panels: Mapping[str, Sequence[Curve]]) -> Figure:
+    """One panel per quantity, one line per robot, over environment steps."""
+    columns = min(3, len(panels))
+    figure, axes = _panels(-(-len(panels) // columns), columns)
+    colours = _palette(curve.robot for curves in panels.values() for curve in curves)
+    for ax, (title, curves) in zip(axes.flat, panels.items(), strict=False):
+        for curve in sorted(curves, key=lambda curve: curve.robot):
+            ax.plot(np.array(curve.env_steps) / 1e6, curve.values, color=colours[curve.robot], label=curve.robot)
+        ax.set_title(title, fontsize=10)
+        ax.set_xlabel("environment steps [M]", fontsize=9)
+    for ax in axes.flat[len(panels) :]:
+        ax.set_visible(False)
+    _legend(figure, axes.flat[0], len(colours))
+    return figure
+
+
+def _palette(names: Iterable[str]) -> dict[str, str]:
+    """The same colour for the same fleet's robot in every figure."""
+    return {name: COLOURS[i % len(COLOURS)] for i, name in enumerate(sorted(set(names)))}
+
+
+def error_rounds(scores: Sequence[RoundScores]) -> Figure:
+    """Errors over rounds (paper, Fig. tracking-error curves): open triangles specialists, filled ones generalists."""
+    figure, axes = _panels(1, len(ERRORS), width=2.6)
+    colours = _palette(score.robot for score in scores)
+    for d, ax in enumerate(axes.flat):
+        for robot, colour in colours.items():
+            own = sorted((s for s in scores if s.robot == robot), key=lambda s: s.position)
+            ax.plot([s.position for s in own], [s.errors[d] for s in own], color=colour, linewidth=1.2, label=robot)
+            for score in own:
+                face = "white" if score.specialist else colour
+                ax.plot(score.position, score.errors[d], "^", color=colour, markerfacecolor=face)
+        ax.set_title(ERRORS[d], fontsize=10)
+        ax.set_xlabel("round", fontsize=9)
+        ax.set_ylim(bottom=0)
+        ax.xaxis.get_major_locator().set_params(integer=True)
+    for label, face in (("specialist", "white"), ("generalist", "black")):
+        axes[0, 0].plot([], [], "^", color="black", markerfacecolor=face, label=label)
+    _legend(figure, axes[0, 0], len(colours) + 2)
+    return figure
+
+
+def latent_maps(maps: Mapping[str, tuple[Embeddings, NDArray[np.float32], float, float]]) -> Figure:
+    """t-SNE maps side by side; each with its silhouette score and linear-probe accuracy in the title."""
+    figure, axes = _panels(1, len(maps), width=3.6, height=3.4)
+    for ax, (title, (embeddings, points, silhouette, accuracy)) in zip(axes.flat, maps.items(), strict=True):
+        colours = _palette(embeddings.robots)
+        for i, robot in enumerate(embeddings.robots):
+            own = points[embeddings.robot == i]
+            ax.scatter(own[:, 0], own[:, 1], s=8, color=colours[robot], marker=MARKERS[i % 7], label=robot)
+        ax.set_title(f"{title}\nsilhouette {silhouette:.2f}, linear probe {accuracy:.0%}", fontsize=10)
+        ax.set_xticks([])
+        ax.set_yticks([])
+    _legend(figure, axes.flat[0], len(COLOURS))
+    return figure
+
+
+def responses(all_responses: Sequence[Response]) -> Figure:
+    """Commanded (dashed) and measured traces: one row per robot, one column per command."""
+    figure, axes = _panels(len(all_responses), len(TRACES), width=2.6, height=1.8)
+    for row, response in zip(axes, all_responses, strict=True):
+        for d, ax in enumerate(row):
+            ax.plot(response.time, response.commanded[:, d], "--", color="0.3", linewidth=1, label="commanded")
+            ax.plot(response.time, response.measured[:, d], color=COLOURS[0], linewidth=1, label="measured")
+        row[0].set_ylabel(response.robot, fontsize=10)
+    for d, title in enumerate(TRACES):
+        axes[0, d].set_title(title, fontsize=10)
+        axes[-1, d].set_xlabel("time [s]", fontsize=9)
+    _legend(figure, axes[0, 0], 2)
+    return figure
+
+
+def robustness(panels: Iterable[tuple[Sweep, Mapping[float, Mapping[str, RobotMetrics]]]]) -> Figure:
+    """Survival (top) and mean error relative to standing still (bottom) over each disturbance."""
+    sweeps = list(panels)
+    figure, axes = _panels(2, len(sweeps))
+    for column, (sweep, scores) in zip(axes.T, sweeps, strict=True):
+        colours = _palette(next(iter(scores.values())))
+        for i, (robot, colour) in enumerate(colours.items()):
+            style = {"color": colour, "marker": MARKERS[i % 7], "markersize": 4, "label": robot}
+            column[0].plot(list(scores), [100 * score[robot].survival for score in scores.values()], **style)
+            column[1].plot(list(scores), [_relative(score[robot]) for score in scores.values()], **style)
+        column[0].set_ylabel("survival [%]", fontsize=9)
+        column[0].set_ylim(-3, 103)
+        column[1].set_ylabel("error / standing still [-]", fontsize=9)
+        column[1].set_ylim(bottom=0)
+        column[1].set_xlabel(sweep.label, fontsize=9)
+    _legend(figure, axes[0, 0], len(COLOURS))
+    return figure
+
+
+def _relative(metrics: RobotMetrics) -> float:
+    """Mean charged error of one robot as a share of standing still."""
+    charged = metrics.subsets["all"].charged
+    return float(np.mean([e / floor for e, floor in zip(charged, STAND_STILL, strict=True) if e is not None]))

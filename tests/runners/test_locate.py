@@ -1,0 +1,43 @@
+"""Finding checkpoints and scores in a run's folder."""
+
+from __future__ import annotations
+
+import pytest
+
+from eagle_rl.errors import CheckpointError
+from eagle_rl.runners.judged import judged_results
+from eagle_rl.runners.locate import find_checkpoint
+from eagle_rl.runners.records import read_plan, stage_dir
+from eagle_rl.runners.stages import run_experiment
+from tests.runners.toy_run import make_toy_env, toy_experiment
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    cfg = toy_experiment(iterations=2, judge_envs=2)
+    return run_experiment(cfg, tmp_path_factory.mktemp("run"), make_toy_env)
+
+
+def test_a_run_means_its_most_advanced_generalist(run):
+    assert find_checkpoint(run.run_dir) == run.generalist
+
+
+def test_a_stage_means_its_latest_checkpoint(run):
+    folder = stage_dir(run.run_dir, "round1/specialist_two")
+    assert find_checkpoint(folder) == find_checkpoint(folder / "checkpoints") == folder / "checkpoints" / "model_2.pt"
+
+
+def test_files_mean_themselves(run, tmp_path):
+    assert find_checkpoint(run.generalist.with_suffix(".json")) == run.generalist
+    assert find_checkpoint(tmp_path / "policy.safetensors") == tmp_path / "policy.safetensors"
+
+
+def test_a_folder_without_checkpoints_is_refused_in_words(tmp_path):
+    with pytest.raises(CheckpointError, match=r"model_<iteration>\.pt"):
+        find_checkpoint(tmp_path)
+
+
+def test_scores_of_a_run_are_rows_with_all_specialists_in_one(run):
+    rows = judged_results(run.run_dir, read_plan(run.run_dir))
+    assert list(rows) == ["generalist", "specialist, round 1", "generalist, round 1"]
+    assert [list(result.robots) for result in rows["specialist, round 1"]] == [["one"], ["two"], ["three"]]
