@@ -175,6 +175,14 @@ def test_weights_of_another_shape_are_refused_before_any_is_changed(tmp_path):
     compare(before, parameters(runner), "parameters after a refusal")
 
 
+def test_a_checkpoint_of_another_number_of_processes_is_refused(tmp_path):
+    state = make_runner()._state()
+    state["processes"] *= 2
+    path = ckpt.save_checkpoint(tmp_path, state, Provenance(), iteration=1, env_steps=0)
+    with pytest.raises(CheckpointError, match="written by 2 processes, resumed by 1"):
+        make_runner().load(path)
+
+
 def test_a_stage_starts_from_the_weights_of_another_with_fresh_counters(tmp_path):
     root = make_runner(tmp_path)
     path = root.learn(2)
