@@ -23,7 +23,7 @@ def judged_results(run_dir: Path, stages: Sequence[Stage]) -> dict[str, list[Eva
     """Results as rows of a table: the generalist, then of each round its specialists and its generalist."""
     rows: dict[str, list[EvaluationResult]] = {}
     for stage, file in judged_stages(run_dir, stages):
-        policy = "specialist" if stage.kind == "specialist" else "generalist"
+        policy = "specialist" if stage.specialised else "base" if stage.kind == "base" else "generalist"
         label = f"{policy}, round {stage.round}" if stage.round else stage.name
         rows.setdefault(label, []).append(EvaluationResult.read(file))
     return rows
