@@ -1,1 +1,1 @@
-"""Measurements of speed and memory; ``eagle bench`` runs them. Nothing here is a test: figures depend on the machine."""
+"""Measurements of speed and memory, run by ``eagle bench``; figures depend on the machine, so none is a test."""

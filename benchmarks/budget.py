@@ -1,4 +1,4 @@
-"""Where the time of a piece of code goes: methods are watched from outside, so that the code itself stays free of timers."""
+"""Where the time of some code goes: methods are watched from outside, so that the code stays free of timers."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from typing_extensions import Self
 class Budget:
     """Time spent in watched methods and in none of their watched callees, by section, while entered.
 
-    ``wall`` is what passed; ``cpu`` is what all threads of the process worked in it, so that a section that waits, or is
-    kept from its core by other processes, shows more wall than CPU time.
+    ``wall`` is what passed; ``cpu`` is what all threads of the process worked in it, so that a section that waits, or
+    is kept from its core by other processes, shows more wall than CPU time.
     """
 
     def __init__(self) -> None:
@@ -40,7 +40,9 @@ class Budget:
         self._stack = ["other"]
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         """Stop, and put the methods back."""
         self._book()
         for owner, method, original in reversed(self._originals):

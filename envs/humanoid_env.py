@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, fields
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -13,7 +14,6 @@ from torch import Tensor
 
 from eagle_rl.config.schema import TaskCfg
 
-from .geometry import rotate_inverse
 from .mdp.aids import LearningAids, harness_damping, harness_wrench
 from .mdp.commands import CommandSampler
 from .mdp.curriculum import penalty_scale
@@ -32,14 +32,15 @@ from .mdp.observations import (
 from .mdp.randomization import Randomizer
 from .mdp.rewards import RewardContext, compute_rewards, success_scores
 from .mdp.terminations import terminations
+from .measure import measured
 from .pooling import pool_robots, share
 from .rng import CounterRng
 from .robots.embodiment import pooled_embodiment
 from .robots.model import build_model
-from .robots.sensors import SENSOR_SLICES
 from .robots.slots import NUM_SLOTS
 from .robots.spec import RobotSpec
 from .sim.batch import RobotBatch
+from .sim.health import MAX_ACTION
 from .sim.pool import PhysicsPool
 from .state import PooledState
 from .step_log import StepLog, episode_ratio
@@ -110,7 +111,7 @@ class HumanoidEnv(VecEnv):
         self.layout = ObservationLayout(observations)
         self.mirror = self.layout.mirror(self.device)
         self._noise = noise_scale(observations, self.robots)
-        self._log = StepLog(self.robot_names, self.robots.robot_id)
+        self.step_log = StepLog(self.robot_names, self.robots.robot_id)
         self._all = torch.arange(num_envs, device=self.device)
         self._pinned: Tensor | None = None
         self._allocate(dtype)
@@ -143,37 +144,36 @@ class HumanoidEnv(VecEnv):
         """Advance one control step.
 
         Args:
-            actions: policy output in slots, shape (N, 32); absent slots are ignored.
+            actions: policy output in slots, shape (N, 32); absent slots are ignored. Where an action is not finite or
+                absurd, the environment counts as sick.
 
         Returns:
             Observations after resets, rewards (N,), dones (N,), and extras with ``time_outs``, ``log``, and the true
             last observations of the environments that timed out (``final_ids``, ``final_observations``).
         """
-        clip = self.task.control.action_clip
-        self._last_last_actions, self._last_actions = self._last_actions, self._actions
-        self._actions = actions.to(self._actions.dtype).clamp(-clip, clip) * self.robots.slot_mask
+        targets = self._act(actions)
         self.randomizer.push(self.step_count, self.penalty_scale, self.step_dt)
-        targets = self.robots.default_joint_pos + self.robots.action_scale * self._actions
-        staged = self.pool.step(targets + self.randomizer.motor_offset, self._harness())
+        staged = self.pool.step(targets, self._harness())
         self.common_step_counter += 1
         self.episode_length_buf = self.episode_length_buf + 1
         self.step_count += 1
         self.phase = advance_phase(self.phase, self.step_dt, self.task.gait)
 
-        sick = self.pool.faults()
+        causes = self.pool.causes()
+        sick = causes > 0
         self.state = self._derive(staged)
         reasons = terminations(self.state, self.task.terminations)
-        terminated = torch.stack([*reasons.values(), sick]).any(dim=0)
-        time_outs = (self.episode_length_buf >= self.max_episode_length) & ~terminated
-        dones = terminated | time_outs
-        rewards, terms = self._rewards(terminated)
-        rewards = torch.where(sick, torch.zeros_like(rewards), rewards)
+        fallen = torch.stack(list(reasons.values())).any(dim=0) & ~sick
+        time_outs = (self.episode_length_buf >= self.max_episode_length) & ~fallen & ~sick
+        dones = fallen | sick | time_outs
+        rewards, terms = self._rewards(fallen)
+        rewards = rewards.masked_fill(sick, 0.0)
 
         self._observe()
         final_ids = (dones if self.final_observations_of_falls else time_outs).nonzero().squeeze(1)
         extras: dict[str, Any] = {"time_outs": time_outs, "final_ids": final_ids}
         extras["final_observations"] = self._groups(final_ids)
-        extras["log"] = self._account(terms, reasons | {"sick": sick}, dones, time_outs)
+        extras["log"] = self._account(terms, reasons, causes, dones, time_outs)
         reset_ids = dones.nonzero().squeeze(1)
         if len(reset_ids):
             self._reset(reset_ids)
@@ -208,7 +208,26 @@ class HumanoidEnv(VecEnv):
         """k, the factor on the penalties of the curriculum (HugWBC 4)."""
         return penalty_scale(self.task.rewards, self.common_step_counter)
 
+    @property
+    def fault_folder(self) -> Path | None:
+        """Where the last states of sick environments are kept; None keeps none."""
+        return self.pool.fault_folder
+
+    @fault_folder.setter
+    def fault_folder(self, folder: Path | None) -> None:
+        self.pool.fault_folder = folder
+
     # --- parts of the step --------------------------------------------------------------------------------------------
+
+    def _act(self, actions: Tensor) -> Tensor:
+        """Remember the actions and turn them into canonical PD targets [rad], (N, 32); NaN where one is absurd."""
+        clip, live = self.task.control.action_clip, self.robots.slot_mask > 0
+        sound = actions.abs() <= MAX_ACTION
+        self._last_last_actions, self._last_actions = self._last_actions, self._actions
+        self._actions = torch.where(live & sound, actions.to(self._actions.dtype).clamp(-clip, clip), 0.0)
+        targets = self.robots.default_joint_pos + self.robots.action_scale * self._actions
+        absurd = (live & ~sound).any(dim=1, keepdim=True)
+        return (targets + self.randomizer.motor_offset).masked_fill(absurd, torch.nan)
 
     def _harness(self) -> Tensor | None:
         """Wrench of the virtual harness, or None once it is off for every robot."""
@@ -224,39 +243,17 @@ class HumanoidEnv(VecEnv):
 
     def _derive(self, staged: Tensor, ids: Tensor | None = None) -> PooledState:
         """Turn staging rows into the pooled state, with the command, phase and actions now in force."""
-        columns = self.pool.columns
-        sensors = staged[:, columns["sensors"]]
-        quat = staged[:, columns["root_quat"]]
-        joint_vel = staged[:, columns["joint_vel"]]
-        down = quat.new_tensor([0.0, 0.0, -1.0]).expand(len(quat), 3)
+        physical = measured(staged, self.pool.columns)
 
         def of(buffer: Tensor) -> Tensor:
             return buffer if ids is None else buffer[ids]
 
-        def sensor(name: str, *shape: int) -> Tensor:
-            return sensors[:, SENSOR_SLICES[name]].reshape(-1, *shape)
-
-        last_joint_vel = of(self._last_joint_vel)
-        foot_pos = sensor("sole_pos", 2, 3)
-        root_pos = staged[:, columns["root_pos"]]
         return PooledState(
-            root_pos_w=root_pos,
-            root_quat_w=quat,
-            base_lin_vel_b=rotate_inverse(quat, staged[:, columns["root_lin_vel_w"]]),
-            base_ang_vel_b=staged[:, columns["base_ang_vel_b"]],
-            projected_gravity_b=rotate_inverse(quat, down),
-            base_height=root_pos[:, 2],
-            joint_pos=staged[:, columns["joint_pos"]],
-            joint_vel=joint_vel,
-            joint_acc=(joint_vel - last_joint_vel) / self.step_dt,
-            joint_torque=staged[:, columns["joint_torque"]],
-            foot_pos_w=foot_pos,
-            foot_vel_w=sensor("sole_vel", 2, 3),
-            foot_force_w=sensor("foot_force", 2, 3),
-            foot_height=foot_pos[..., 2],
+            **physical,
+            base_height=physical["root_pos_w"][:, 2],
+            joint_acc=(physical["joint_vel"] - of(self._last_joint_vel)) / self.step_dt,
+            foot_height=physical["foot_pos_w"][..., 2],
             last_foot_contact=of(self._last_contact),
-            link_force_w=sensor("contact_force", 7, 3),
-            ground_contact=sensor("floor_contact", 3).gt(0).any(dim=1),
             height_scan=staged.new_zeros(len(staged), self.layout.num_scan_points),
             friction=of(self.randomizer.friction),
             command=of(self.command),
@@ -300,11 +297,12 @@ class HumanoidEnv(VecEnv):
         robots = self.robots if ids is None else self.robots.rows(ids)
         embodiment = self.embodiment if ids is None or self.embodiment is None else self.embodiment[ids]
         frames = self.history.frames if ids is None else self.history.frames[ids]
+        frame = self._last_frame if ids is None else self._last_frame[ids]
         groups = {
             "history": frames.flatten(1),
             "command": command_observation(state, cfg),
             "clock": clock(state.foot_phase),
-            "critic": critic_observation(state, robots, embodiment, cfg, self.task.randomization.friction),
+            "critic": critic_observation(frame, state, robots, embodiment, cfg, self.task.randomization.friction),
             "estimate": estimation_target(state, embodiment, cfg),
             "slot_mask": robots.slot_mask,
         }
@@ -361,14 +359,15 @@ class HumanoidEnv(VecEnv):
         self.standing = (self.command[:, :3] == 0).all(dim=1)
 
     def _account(
-        self, terms: dict[str, Tensor], reasons: dict[str, Tensor], dones: Tensor, time_outs: Tensor
+        self, terms: dict[str, Tensor], reasons: dict[str, Tensor], causes: Tensor, dones: Tensor, time_outs: Tensor
     ) -> dict[str, Tensor | float]:
         """Add the step to the log and the aids; returns tags and values once per ``LOG_INTERVAL``."""
         match = contact_match(self.state, self.task.gait)
-        self._log.add(terms, reasons, self.tracking_errors(), match, dones & ~time_outs, dones, self.state.standing)
+        falls = dones & ~time_outs
+        self.step_log.add(terms, reasons, causes, self.tracking_errors(), match, falls, dones, self.state.standing)
         if self.common_step_counter % LOG_INTERVAL:
             return {}
-        entry, falls_per_step, match_per_robot = self._log.flush()
+        entry, falls_per_step, match_per_robot = self.step_log.flush()
         self.aids.update(episode_ratio(falls_per_step, self.max_episode_length), match_per_robot)
         self._set_harness_damping()
         k = torch.tensor(self.penalty_scale)
@@ -381,6 +380,9 @@ class HumanoidEnv(VecEnv):
         "_last_last_actions _last_joint_vel _last_contact _last_frame"
     ).split()
 
+    _PARTS = ("randomizer", "pool", "commands", "aids", "step_log")
+    """What has a state of its own; randomization first, because the physics is recomputed under it."""
+
     def state_dict(self) -> dict[str, Any]:
         """Everything a resumed run needs to go on bit for bit (tensors and numbers only)."""
         return {
@@ -388,12 +390,7 @@ class HumanoidEnv(VecEnv):
             "buffers": {name: getattr(self, name).clone() for name in self._BUFFERS},
             "state": {f.name: getattr(self.state, f.name).clone() for f in fields(self.state)},
             "history": self.history.frames.clone(),
-            "pool": self.pool.state_dict(),
-            "randomizer": self.randomizer.state_dict(),
-            "commands": self.commands.state_dict(),
-            "aids": self.aids.state_dict(),
-            "log": self._log.state_dict(),
-        }
+        } | {name: getattr(self, name).state_dict() for name in self._PARTS}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`state_dict` returned, in an environment built from the same configuration and seed."""
@@ -402,9 +399,6 @@ class HumanoidEnv(VecEnv):
             setattr(self, name, value.to(self.device, copy=True))
         self.state = PooledState(**{name: value.to(self.device) for name, value in state["state"].items()})
         self.history.frames = state["history"].to(self.device, copy=True)
-        self.randomizer.load_state_dict(state["randomizer"])
-        self.pool.load_state_dict(state["pool"])
-        self.commands.load_state_dict(state["commands"])
-        self.aids.load_state_dict(state["aids"])
+        for name in self._PARTS:
+            getattr(self, name).load_state_dict(state[name])
         self._set_harness_damping()
-        self._log.load_state_dict(state["log"])

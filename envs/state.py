@@ -7,10 +7,13 @@ link). Per-foot arrays are in the order left, right. Observations, rewards and t
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from functools import cached_property
 
 import torch
 from torch import Tensor
 from typing_extensions import Self
+
+from .geometry import heading_of
 
 
 @dataclass(kw_only=True)
@@ -48,7 +51,10 @@ class PooledRobots(_Rows):
 
 @dataclass(kw_only=True)
 class PooledState(_Rows):
-    """State after a control step, before resets."""
+    """State after a control step.
+
+    What properties work out is kept: make a new state instead of changing the orientation or forces of an old one.
+    """
 
     root_pos_w: Tensor
     """[m], shape (N, 3)."""
@@ -101,17 +107,22 @@ class PooledState(_Rows):
     last_last_actions: Tensor
     """a_(t-2), shape (N, 32)."""
 
-    @property
+    @cached_property
     def foot_contact(self) -> Tensor:
         """Whether each foot carries more than 1 N, bool, shape (N, 2)."""
         return self.foot_force_w[..., 2] > 1.0
 
-    @property
+    @cached_property
     def base_pitch(self) -> Tensor:
         """Pitch, positive leaning forward: atan2(g_x, -g_z) [rad], shape (N,)."""
         return torch.atan2(self.projected_gravity_b[:, 0], -self.projected_gravity_b[:, 2])
 
-    @property
+    @cached_property
     def base_roll(self) -> Tensor:
         """Roll, positive leaning right: atan2(-g_y, -g_z) [rad], shape (N,)."""
         return torch.atan2(-self.projected_gravity_b[:, 1], -self.projected_gravity_b[:, 2])
+
+    @cached_property
+    def heading_w(self) -> Tensor:
+        """(cos, sin) of the base's yaw, shape (N, 2)."""
+        return heading_of(self.root_quat_w)

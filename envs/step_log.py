@@ -7,6 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from .sim.health import CAUSES
+
 ERROR_NAMES = ("E_vx", "E_vy", "E_omega", "E_h", "E_p")
 
 
@@ -28,6 +30,7 @@ class StepLog:
         self._robot_id = robot_id
         counts = torch.bincount(robot_id, minlength=len(robot_names)).to(torch.float64)
         self._num_envs = counts.unsqueeze(1)
+        self._cause_codes = torch.arange(1, len(CAUSES) + 1, device=robot_id.device)
         self._sums: Tensor | None = None
         self._columns: list[str] = []
         self._steps = 0
@@ -36,17 +39,30 @@ class StepLog:
         self,
         terms: dict[str, Tensor],
         reasons: dict[str, Tensor],
+        causes: Tensor,
         errors: Tensor,
         contact_match: Tensor,
         falls: Tensor,
         dones: Tensor,
         standing: Tensor,
     ) -> None:
-        """Add one step: weighted reward terms (N,), termination reasons (N,), errors (N, 5) and the rest (N,)."""
+        """Add one step.
+
+        Args:
+            terms: weighted reward terms by name, shape (N,) each.
+            reasons: what ended episodes, by name, bool, shape (N,) each.
+            causes: codes of what is wrong with environments, see ``envs.sim.health.CAUSES``, shape (N,).
+            errors: tracking errors in the order of ``ERROR_NAMES``, shape (N, 5).
+            contact_match: share of feet that agree with the clock, shape (N,).
+            falls: episodes that ended before their time, bool, shape (N,).
+            dones: episodes that ended, bool, shape (N,).
+            standing: whether the command is to stand, bool, shape (N,).
+        """
         moving = (~standing).to(contact_match.dtype)
         self._columns = [
             *(f"Episode_Reward/{name}" for name in terms),
             *(f"Episode_Termination/{name}" for name in reasons),
+            *(f"Health/{cause}" for cause in CAUSES),
             *(f"Metrics/{name}" for name in ERROR_NAMES),
             *("match", "moving", "falls", "dones"),
         ]
@@ -54,6 +70,7 @@ class StepLog:
             [
                 *terms.values(),
                 *(reason.to(errors.dtype) for reason in reasons.values()),
+                *(causes.unsqueeze(1) == self._cause_codes).to(errors.dtype).unbind(1),
                 *errors.unbind(1),
                 *(contact_match * moving, moving, falls.to(errors.dtype), dones.to(errors.dtype)),
             ],
@@ -67,7 +84,8 @@ class StepLog:
     def flush(self) -> tuple[dict[str, Tensor], Tensor, Tensor]:
         """Return the interval's tags, each robot's falls per step (R,) and contact match (R,), and start anew.
 
-        Rewards are per second, terminations are shares of the episodes that ended, errors are means over steps.
+        Rewards are per second, terminations are shares of the episodes that ended, errors are means over steps, causes
+        of sickness are counted, and ``Health/sick_share`` is their sum as a share of the environment steps.
         """
         assert self._sums is not None, "flush follows add"
         sums, column = self._sums, {name: i for i, name in enumerate(self._columns)}
@@ -76,6 +94,7 @@ class StepLog:
         match = sums[:, column["match"]] / sums[:, column["moving"]].clamp(min=1.0)
         dones = sums[:, column["dones"]]
         falls_per_step = means[:, column["falls"]]
+        sick_share = sum(means[:, i] for tag, i in column.items() if tag.startswith("Health/"))
         entry: dict[str, Tensor] = {}
         for robot, name in enumerate(self._names):
             for tag, i in column.items():
@@ -85,6 +104,9 @@ class StepLog:
                     entry[f"{tag}/{name}"] = means[robot, i] * 50.0
                 elif tag.startswith("Episode_Termination/"):
                     entry[f"{tag}/{name}"] = sums[robot, i] / dones[robot].clamp(min=1.0)
+                elif tag.startswith("Health/"):
+                    entry[f"{tag}/{name}"] = sums[robot, i]
+            entry[f"Health/sick_share/{name}"] = sick_share[robot]
             entry[f"Metrics/contact_match/{name}"] = match[robot]
             entry[f"Metrics/falls_per_1000_steps/{name}"] = falls_per_step[robot] * 1000.0
         self._sums, self._steps = torch.zeros_like(sums), 0

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from eagle_rl.config.schema import AidsCfg
 
-from ..geometry import rotate_yaw, yaw_of
+from ..geometry import from_yaw_frame
 from ..state import PooledRobots, PooledState
 
 _SMOOTHING = 0.05
@@ -97,24 +97,22 @@ def _decayed(scale: Tensor, fulfilled: Tensor, decay: float) -> Tensor:
     return torch.where(scale < _SNAP, 0.0, scale)
 
 
-def _bounded(x: Tensor, bound: Tensor) -> Tensor:
-    return torch.maximum(torch.minimum(x, bound), -bound)
-
-
-def _tilt_torque(state: PooledState, mass: Tensor) -> Tensor:
-    """Torque toward zero roll and the commanded pitch in the yaw frame [N m], shape (N, 2)."""
+def _tilt_torque(state: PooledState) -> Tensor:
+    """Torque toward zero roll and the commanded pitch in the yaw frame [N m/kg], shape (N, 2)."""
     error = torch.stack((state.base_roll, state.base_pitch - state.command[:, 4]), dim=1)
-    return _bounded(-_TILT_STIFFNESS * mass * error, _MAX_TILT_TORQUE * mass)
+    return (-_TILT_STIFFNESS * error).clamp(-_MAX_TILT_TORQUE, _MAX_TILT_TORQUE)
 
 
-def _force(state: PooledState, robots: PooledRobots, mass: Tensor) -> Tensor:
-    """Drag toward the commanded velocity and support toward the commanded height in the yaw frame [N], (N, 3)."""
-    drag = _DRAG * mass * (state.command[:, :2] - state.base_lin_vel_b[:, :2])
-    drag = _bounded(drag, _MAX_DRAG * _GRAVITY * mass)
-    sag = (robots.nominal_height + state.command[:, 3] - state.base_height).unsqueeze(1)
-    support = _SUPPORT * _GRAVITY * mass + _HEIGHT_STIFFNESS * mass * sag
-    support = torch.minimum(support, _MAX_SUPPORT * _GRAVITY * mass).clamp(min=0.0)
-    return torch.cat((drag, support), dim=1)
+def _drag(state: PooledState) -> Tensor:
+    """Force toward the commanded velocity in the yaw frame [N/kg], shape (N, 2)."""
+    bound = _MAX_DRAG * _GRAVITY
+    return (_DRAG * (state.command[:, :2] - state.base_lin_vel_b[:, :2])).clamp(-bound, bound)
+
+
+def _support(state: PooledState, robots: PooledRobots) -> Tensor:
+    """Force toward the commanded height, upwards only [N/kg], shape (N,)."""
+    sag = robots.nominal_height + state.command[:, 3] - state.base_height
+    return (_SUPPORT * _GRAVITY + _HEIGHT_STIFFNESS * sag).clamp(0.0, _MAX_SUPPORT * _GRAVITY)
 
 
 def harness_wrench(state: PooledState, robots: PooledRobots, scale: Tensor) -> Tensor:
@@ -128,13 +126,11 @@ def harness_wrench(state: PooledState, robots: PooledRobots, scale: Tensor) -> T
     Returns:
         World-frame force [N] and torque [N m] on the base, shape (N, 6); exactly zero where the scale is.
     """
-    mass = robots.total_mass.unsqueeze(1)
-    tilt = _tilt_torque(state, mass)
-    torque = torch.cat((tilt, torch.zeros_like(tilt[:, :1])), dim=1)
-    yaw = yaw_of(state.root_quat_w).unsqueeze(1)
-    wrench = rotate_yaw(yaw, torch.stack((_force(state, robots, mass), torque), dim=1)).flatten(1)
-    scale = scale.to(wrench.dtype).unsqueeze(1)
-    return torch.where(scale > 0.0, wrench * scale, 0.0)
+    support = _support(state, robots).unsqueeze(1)
+    wrench = torch.cat((_drag(state), support, _tilt_torque(state), torch.zeros_like(support)), dim=1)
+    wrench = from_yaw_frame(state.heading_w.unsqueeze(1), wrench.unflatten(1, (2, 3))).flatten(1)
+    strength = (robots.total_mass * scale).unsqueeze(1)
+    return torch.where(strength > 0.0, wrench * strength, 0.0)
 
 
 def harness_damping(robots: PooledRobots, scale: Tensor) -> Tensor:

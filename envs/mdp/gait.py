@@ -6,6 +6,7 @@ A foot's phase runs through [0, 1): stance first, then swing. Sources: paper, Eq
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -66,10 +67,17 @@ def contact_probability(foot_phase: Tensor, cfg: GaitCfg) -> Tensor:
     Returns:
         Shape (N, 2), in [0, 1].
     """
-    edges = homogenise(foot_phase, cfg.stance_ratio).unsqueeze(-1) - foot_phase.new_tensor((0.0, 0.5, 1.0, 1.5))
-    cdf = 0.5 * torch.erfc(edges * (-1.0 / (cfg.contact_smoothing * math.sqrt(2.0))))
-    begin, end, begin_next, end_next = cdf.unbind(-1)
-    return begin * (1.0 - end) + begin_next * (1.0 - end_next)
+    slopes, offsets = _stance_edges(cfg.contact_smoothing, foot_phase.dtype, foot_phase.device)
+    phase = homogenise(foot_phase, cfg.stance_ratio).unsqueeze(-1)
+    begun, not_over, next_begun, next_not_over = torch.erfc(torch.addcmul(offsets, phase, slopes)).unbind(-1)
+    return 0.25 * (begun * not_over + next_begun * next_not_over)
+
+
+@lru_cache(maxsize=16)
+def _stance_edges(smoothing: float, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Slopes and offsets, shape (4,), that bring a phase to the arguments of erfc at the edges of both stances."""
+    slopes = torch.tensor((-1.0, 1.0, -1.0, 1.0), dtype=dtype, device=device) / (smoothing * math.sqrt(2.0))
+    return slopes, -slopes * torch.tensor((0.0, 0.5, 1.0, 1.5), dtype=dtype, device=device)
 
 
 def swing_target(foot_phase: Tensor, swing_height: Tensor, cfg: GaitCfg) -> Tensor:

@@ -8,7 +8,7 @@ from torch import Tensor
 from eagle_rl.config.schema import CommandsCfg, GaitCfg, Range
 
 from ..state import PooledRobots, PooledState
-from .gait import contact_probability
+from .gait import homogenise
 
 ERROR_NAMES = ("lin_vel_x", "lin_vel_y", "ang_vel_z", "base_height", "body_pitch")
 """Columns of every array of tracking errors: E_vx, E_vy, E_omega, E_h, E_p; also the fields of ``CommandsCfg``."""
@@ -37,8 +37,8 @@ def tracking_errors(state: PooledState, robots: PooledRobots) -> Tensor:
 
 
 def contact_match(state: PooledState, cfg: GaitCfg) -> Tensor:
-    """Share of the feet whose contact agrees with the clock (C > 0.5), shape (N,)."""
-    desired = contact_probability(state.foot_phase, cfg) > 0.5
+    """Share of the feet whose contact agrees with the clock (stance, where C > 0.5), shape (N,)."""
+    desired = homogenise(state.foot_phase, cfg.stance_ratio) < 0.5
     return (desired == state.foot_contact).to(state.foot_phase.dtype).mean(dim=1)
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from eagle_rl.config.schema import ObservationsCfg, Range
 
-from ..geometry import rotate_yaw, yaw_of
+from ..geometry import into_yaw_frame
 from ..state import PooledRobots, PooledState
 from .gait import clock
 from .layout import REFERENCE_MASS, SENSED_SIZE, ObservationLayout, scale_vector, scan_points
@@ -31,17 +31,11 @@ COLLISION_FORCE = 2.0
 """Contact force above which a link counts as in collision [N] (HugWBC 5)."""
 
 
-def _scaled(columns: list[Tensor], cfg: ObservationsCfg, group: str) -> Tensor:
-    """Lay columns side by side, scale and bound them."""
+def _scaled(columns: list[Tensor], cfg: ObservationsCfg, group: str, first: int = 0) -> Tensor:
+    """Lay columns side by side, scale and bound them; the first is column ``first`` of its group."""
     x = torch.cat(columns, dim=1)
     scale = scale_vector(cfg, group, x.dtype, x.device)
-    return x.mul_(scale[: x.shape[1]]).clamp_(-cfg.clip, cfg.clip)
-
-
-def _frame_columns(state: PooledState, robots: PooledRobots, cfg: ObservationsCfg) -> list[Tensor]:
-    joint_pos_rel = (state.joint_pos - robots.default_joint_pos) * robots.slot_mask
-    columns = [state.base_ang_vel_b, state.projected_gravity_b, joint_pos_rel, state.joint_vel]
-    return [*columns, state.actions] if cfg.last_action else columns
+    return x.mul_(scale[first : first + x.shape[1]]).clamp_(-cfg.clip, cfg.clip)
 
 
 def proprioception(state: PooledState, robots: PooledRobots, cfg: ObservationsCfg) -> Tensor:
@@ -50,7 +44,9 @@ def proprioception(state: PooledState, robots: PooledRobots, cfg: ObservationsCf
     Returns:
         Shape (N, F), F = 102 with the last action, else 70; zero in absent slots.
     """
-    return _scaled(_frame_columns(state, robots, cfg), cfg, "history")
+    joint_pos_rel = (state.joint_pos - robots.default_joint_pos) * robots.slot_mask
+    columns = [state.base_ang_vel_b, state.projected_gravity_b, joint_pos_rel, state.joint_vel]
+    return _scaled([*columns, state.actions] if cfg.last_action else columns, cfg, "history")
 
 
 def noise_scale(cfg: ObservationsCfg, robots: PooledRobots) -> Tensor:
@@ -121,7 +117,7 @@ def _friction_column(friction: Tensor, friction_range: Range) -> Tensor:
 
 def _privileged_columns(state: PooledState, robots: PooledRobots, friction_range: Range) -> list[Tensor]:
     height = state.base_height - robots.nominal_height
-    forces = rotate_yaw(-yaw_of(state.root_quat_w).unsqueeze(1), state.foot_force_w).flatten(1)
+    forces = into_yaw_frame(state.heading_w.unsqueeze(1), state.foot_force_w).flatten(1)
     scan = height.unsqueeze(1) - state.height_scan
     return [
         state.base_lin_vel_b,
@@ -135,11 +131,17 @@ def _privileged_columns(state: PooledState, robots: PooledRobots, friction_range
 
 
 def critic_observation(
-    state: PooledState, robots: PooledRobots, embodiment: Tensor | None, cfg: ObservationsCfg, friction_range: Range
+    frame: Tensor,
+    state: PooledState,
+    robots: PooledRobots,
+    embodiment: Tensor | None,
+    cfg: ObservationsCfg,
+    friction_range: Range,
 ) -> Tensor:
     """What the critic sees, never corrupted: frame, command, clock and everything privileged (paper; HugWBC 5).
 
     Args:
+        frame: clean :func:`proprioception` of the state, shape (N, F).
         state: state after the step.
         robots: constants of each environment's robot.
         embodiment: standardised o_ea, shape (N, E), or None where it is off.
@@ -149,9 +151,9 @@ def critic_observation(
     Returns:
         Shape (N, C), columns as in ``ObservationLayout.groups["critic"]``.
     """
-    columns = _frame_columns(state, robots, cfg)
-    columns += [state.command, clock(state.foot_phase), *_privileged_columns(state, robots, friction_range)]
-    return _scaled(columns if embodiment is None else [*columns, embodiment], cfg, "critic")
+    columns = [state.command, clock(state.foot_phase), *_privileged_columns(state, robots, friction_range)]
+    columns = columns if embodiment is None else [*columns, embodiment]
+    return torch.cat((frame, _scaled(columns, cfg, "critic", first=frame.shape[1])), dim=1)
 
 
 def estimation_target(state: PooledState, embodiment: Tensor | None, cfg: ObservationsCfg) -> Tensor:

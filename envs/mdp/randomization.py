@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from eagle_rl.config.schema import RandomizationCfg
+from eagle_rl.config.schema import RandomizationCfg, Range
 
 from ..geometry import quat_from_yaw
 from ..rng import CounterRng
@@ -47,17 +47,23 @@ class Randomizer:
         """Redraw what is redrawn at each reset for some environments, ``count`` being their episode numbers."""
         if not self.cfg.enabled:
             return
-        cfg, mask = self.cfg, self._robots.slot_mask[ids]
-
-        def draw(bounds: tuple[float, float], stream: str, size: int) -> Tensor:
-            return self._rng.uniform_in(*bounds, stream, count, size, ids).to(mask.dtype)
-
-        strength = draw(cfg.strength_scale, "strength", NUM_SLOTS)
-        self.friction[ids] = draw(cfg.friction, "friction", 1).squeeze(1)
-        self.motor_offset[ids] = draw(cfg.motor_offset, "motor_offset", NUM_SLOTS) * mask
-        self.latency[ids] = draw(cfg.sensing_latency_s, "latency", 1) / step_dt
-        self._stiffness_scale[ids] = strength * draw(cfg.stiffness_scale, "stiffness", NUM_SLOTS)
-        self._damping_scale[ids] = strength * draw(cfg.damping_scale, "damping", NUM_SLOTS)
+        cfg = self.cfg
+        strength, friction, motor_offset, latency, stiffness, damping = self._draw(
+            "reset",
+            ids,
+            count,
+            (cfg.strength_scale, NUM_SLOTS),
+            (cfg.friction, 1),
+            (cfg.motor_offset, NUM_SLOTS),
+            (cfg.sensing_latency_s, 1),
+            (cfg.stiffness_scale, NUM_SLOTS),
+            (cfg.damping_scale, NUM_SLOTS),
+        )
+        self.friction[ids] = friction.squeeze(1)
+        self.motor_offset[ids] = motor_offset * self._robots.slot_mask[ids]
+        self.latency[ids] = latency / step_dt
+        self._stiffness_scale[ids] = strength * stiffness
+        self._damping_scale[ids] = strength * damping
         self._apply(ids)
 
     def initial_state(self, ids: Tensor, count: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -66,17 +72,27 @@ class Randomizer:
         root = robots.total_mass.new_zeros(len(ids), 13)
         root[:, 2] = robots.nominal_height + SPAWN_CLEARANCE * self.cfg.enabled
         root[:, 3] = 1.0
-        joint_pos = robots.default_joint_pos.clone()
-        joint_vel = torch.zeros_like(joint_pos)
-        if self.cfg.enabled:
-            draw = self._rng.uniform_in
-            root[:, 0:2] = draw(-1.0, 1.0, "init_xy", count, 2, ids)
-            root[:, 3:7] = quat_from_yaw(draw(-np.pi, np.pi, "init_yaw", count, 1, ids).squeeze(1).to(root.dtype))
-            root[:, 7:13] = draw(*self.cfg.init_root_vel, "init_root_vel", count, 6, ids)
-            scale = draw(*self.cfg.init_joint_scale, "init_joint_scale", count, NUM_SLOTS, ids)
-            joint_pos = (joint_pos * scale).clamp(robots.joint_soft_lower, robots.joint_soft_upper)
-            joint_vel = draw(*self.cfg.init_joint_vel, "init_joint_vel", count, NUM_SLOTS, ids) * robots.slot_mask
-        return root, joint_pos, joint_vel
+        if not self.cfg.enabled:
+            return root, robots.default_joint_pos, torch.zeros_like(robots.default_joint_pos)
+        root[:, 0:2], yaw, root[:, 7:13], scale, joint_vel = self._draw(
+            "initial_state",
+            ids,
+            count,
+            ((-1.0, 1.0), 2),
+            ((-np.pi, np.pi), 1),
+            (self.cfg.init_root_vel, 6),
+            (self.cfg.init_joint_scale, NUM_SLOTS),
+            (self.cfg.init_joint_vel, NUM_SLOTS),
+        )
+        root[:, 3:7] = quat_from_yaw(yaw.squeeze(1))
+        joint_pos = (robots.default_joint_pos * scale).clamp(robots.joint_soft_lower, robots.joint_soft_upper)
+        return root, joint_pos, joint_vel * robots.slot_mask
+
+    def _draw(self, stream: str, ids: Tensor, count: Tensor, *rows: tuple[Range, int]) -> list[Tensor]:
+        """Draw several quantities from one stream, each from its range and so many wide, shapes (n, width)."""
+        widths = [width for _, width in rows]
+        numbers = self._rng.uniform(stream, count, sum(widths), ids).to(self.friction.dtype)
+        return [low + (high - low) * u for ((low, high), _), u in zip(rows, numbers.split(widths, dim=1), strict=True)]
 
     def push(self, steps: Tensor, penalty_scale: float, step_dt: float) -> None:
         """Push the environments whose time has come; ``steps`` counts each one's control steps since creation."""

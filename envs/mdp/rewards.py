@@ -8,13 +8,14 @@ Feet j are (left, right); ``rho_kappa(x) = exp(-x / kappa)`` is applied to squar
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from eagle_rl.config.schema import GaitCfg, RewardsCfg
+from eagle_rl.config.schema import GaitCfg, RewardsCfg, RewardWeightsCfg
 
 from ..robots.slots import HIP_DEVIATION_SLOTS, UPPER_SLOTS
 from ..state import PooledRobots, PooledState
@@ -41,17 +42,20 @@ class RewardContext:
     """Learning aid s, 0 for the paper's kernel, shape (N,)."""
     terminated: Tensor
     """Whether the episode ended by anything but its time limit, bool, shape (N,)."""
-    _cache: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
+    _cache: dict[TermFunction, Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
 
-    def contact_probability(self, state: PooledState) -> Tensor:
-        """C(phi) of both feet, shape (N, 2), computed once for the three terms that use it."""
-        if "contact_probability" not in self._cache:
-            self._cache["contact_probability"] = gait.contact_probability(state.foot_phase, self.gait)
-        return self._cache["contact_probability"]
+    def once(self, function: TermFunction, state: PooledState, robots: PooledRobots) -> Tensor:
+        """Value of a term, or of a part that several terms share, computed at its first use."""
+        if function not in self._cache:
+            self._cache[function] = function(state, robots, self)
+        return self._cache[function]
+
+
+TermFunction = Callable[[PooledState, PooledRobots, RewardContext], Tensor]
 
 
 def _rho(squared_error: Tensor, kappa: float | Tensor) -> Tensor:
-    return torch.exp(-squared_error / kappa)
+    return torch.exp(squared_error / -kappa)
 
 
 def _dot(x: Tensor, y: Tensor) -> Tensor:
@@ -83,17 +87,27 @@ def body_pitch(state: PooledState, robots: PooledRobots, ctx: RewardContext) -> 
     return (state.command[:, 4] - state.base_pitch).square()
 
 
+def _contact_probability(state: PooledState, robots: PooledRobots, ctx: RewardContext) -> Tensor:
+    """C(phi) of both feet, shape (N, 2)."""
+    return gait.contact_probability(state.foot_phase, ctx.gait)
+
+
+def _foot_speed(state: PooledState, robots: PooledRobots, ctx: RewardContext) -> Tensor:
+    """Squared horizontal speed of both feet [m^2/s^2], shape (N, 2)."""
+    return _square_sum(state.foot_vel_w[..., :2])
+
+
 def foot_swing(state: PooledState, robots: PooledRobots, ctx: RewardContext) -> Tensor:
     """``sum_j (1 - C_j) (l_target,j - l_foot,j)^2``, vertical, clipped [m^2], an error (Foot-swing position)."""
     target = gait.swing_target(state.foot_phase, robots.swing_height, ctx.gait)
-    error = (1.0 - ctx.contact_probability(state)) * (target - state.foot_height).square()
-    return error.sum(dim=1).clamp(max=ctx.cfg.foot_swing_clip)
+    swing = 1.0 - ctx.once(_contact_probability, state, robots)
+    return _dot(swing, (target - state.foot_height).square()).clamp(max=ctx.cfg.foot_swing_clip)
 
 
 def contact_vel(state: PooledState, robots: PooledRobots, ctx: RewardContext) -> Tensor:
     """``sum_j C_j (1 - rho(|v_xy,j|^2))``: a foot in stance should not move [-], an error (Contact vel.)."""
-    moving = 1.0 - _rho(_square_sum(state.foot_vel_w[..., :2]), ctx.cfg.contact_vel_kappa)
-    return _dot(ctx.contact_probability(state), moving)
+    moving = 1.0 - _rho(ctx.once(_foot_speed, state, robots), ctx.cfg.contact_vel_kappa)
+    return _dot(ctx.once(_contact_probability, state, robots), moving)
 
 
 def contact_force(state: PooledState, robots: PooledRobots, ctx: RewardContext) -> Tensor:
@@ -101,9 +115,15 @@ def contact_force(state: PooledState, robots: PooledRobots, ctx: RewardContext) 
 
     The norm is over all three components, else a vertically loaded swing foot goes unpunished (HugWBC 11.2).
     """
-    kappa = ctx.cfg.contact_force_kappa + SHAPING_KAPPA * ctx.gait_shaping * (robots.total_mass / REFERENCE_MASS).square()
-    loaded = 1.0 - _rho(_square_sum(state.foot_force_w), kappa.unsqueeze(1))
-    return _dot(1.0 - ctx.contact_probability(state), loaded)
+    kappa = (
+        ctx.cfg.contact_force_kappa + SHAPING_KAPPA * ctx.gait_shaping * (robots.total_mass / REFERENCE_MASS).square()
+    )
+    return _swing_load(state, robots, ctx, kappa.unsqueeze(1))
+
+
+def _swing_load(state: PooledState, robots: PooledRobots, ctx: RewardContext, kappa: float | Tensor) -> Tensor:
+    loaded = 1.0 - _rho(_square_sum(state.foot_force_w), kappa)
+    return _dot(1.0 - ctx.once(_contact_probability, state, robots), loaded)
 
 
 def roll_pitch_rate(state: PooledState, robots: PooledRobots, ctx: RewardContext) -> Tensor:
@@ -122,7 +142,7 @@ def foot_slip(state: PooledState, robots: PooledRobots, ctx: RewardContext) -> T
     The printed form has no contact gate and would slow down swing feet (HugWBC 11.3).
     """
     contact = (state.foot_contact | state.last_foot_contact).to(state.foot_vel_w.dtype)
-    return _dot(contact, 1.0 - _rho(_square_sum(state.foot_vel_w[..., :2]), ctx.cfg.foot_slip_kappa))
+    return _dot(contact, 1.0 - _rho(ctx.once(_foot_speed, state, robots), ctx.cfg.foot_slip_kappa))
 
 
 def action_rate(state: PooledState, robots: PooledRobots, ctx: RewardContext) -> Tensor:
@@ -188,7 +208,7 @@ def joint_limits(state: PooledState, robots: PooledRobots, ctx: RewardContext) -
 class RewardTerm(NamedTuple):
     """A term and the scales that act on it besides its weight."""
 
-    function: Callable[[PooledState, PooledRobots, RewardContext], Tensor]
+    function: TermFunction
     curriculum: bool = False
     """Whether the penalty scale k multiplies it (rows marked (k), HugWBC 4)."""
     shaped: bool = False
@@ -236,16 +256,29 @@ def compute_rewards(
         The reward, shape (N,), and its weighted terms by name, each (N,); terms of zero weight are absent.
     """
     shaped_weight = 1.0 + SHAPING_WEIGHT * ctx.gait_shaping
-    terms: dict[str, Tensor] = {}
+    values: dict[str, Tensor] = {}
     for name, term in REWARD_TERMS.items():
-        weight = getattr(ctx.cfg.weights, name)
-        if weight == 0.0:
-            continue
-        factor = weight * step_dt * (penalty_scale if term.curriculum else 1.0)
-        value = term.function(state, robots, ctx) * factor
-        terms[name] = value * shaped_weight if term.shaped else value
-    total = torch.stack(list(terms.values())).sum(dim=0) if terms else torch.zeros_like(state.base_height)
-    return total, terms
+        if getattr(ctx.cfg.weights, name) != 0.0:
+            value = ctx.once(term.function, state, robots)
+            values[name] = value * shaped_weight if term.shaped else value
+    if not values:
+        return torch.zeros_like(state.base_height), {}
+    unweighted = torch.stack(list(values.values()))
+    weighted = unweighted * _factors(ctx.cfg.weights, penalty_scale, step_dt, unweighted.dtype, unweighted.device)
+    return weighted.sum(dim=0), dict(zip(values, weighted.unbind(), strict=True))
+
+
+@lru_cache(maxsize=4)
+def _factors(
+    weights: RewardWeightsCfg, penalty_scale: float, step_dt: float, dtype: torch.dtype, device: torch.device
+) -> Tensor:
+    """Factor on each term of non-zero weight, in the order of ``REWARD_TERMS``, shape (T, 1)."""
+    factors = [
+        [getattr(weights, name) * step_dt * (penalty_scale if term.curriculum else 1.0)]
+        for name, term in REWARD_TERMS.items()
+        if getattr(weights, name) != 0.0
+    ]
+    return torch.tensor(factors, dtype=dtype, device=device)
 
 
 def success_scores(
@@ -256,10 +289,9 @@ def success_scores(
     Linear and angular velocity tracking, then 1 minus the mean over the feet of contact force and contact velocity
     errors; all by the table's kernels, whatever the gait shaping.
     """
-    plain = replace(ctx, gait_shaping=torch.zeros_like(ctx.gait_shaping))
     return (
-        lin_vel_tracking(state, robots, plain),
-        ang_vel_tracking(state, robots, plain),
-        1.0 - 0.5 * contact_force(state, robots, plain),
-        1.0 - 0.5 * contact_vel(state, robots, plain),
+        ctx.once(lin_vel_tracking, state, robots),
+        ctx.once(ang_vel_tracking, state, robots),
+        1.0 - 0.5 * _swing_load(state, robots, ctx, ctx.cfg.contact_force_kappa),
+        1.0 - 0.5 * ctx.once(contact_vel, state, robots),
     )

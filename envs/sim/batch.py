@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import mujoco
 import numpy as np
-from mujoco.batch import Batch
+from mujoco.batch import Batch, SimulationError
 from numpy.typing import NDArray
 
 from ..robots.spec import Array, RobotSpec
+from .fault import Fault
+from .health import CAUSES, FlightRecorder, diagnose
 
 _VEL = mujoco.mjtStage.mjSTAGE_VEL.value
 _ACC = mujoco.mjtStage.mjSTAGE_ACC.value
@@ -48,6 +50,10 @@ class RobotBatch:
         self.sensordata: Array = self._batch.bind("sensordata")
         self._base = int(model.jnt_bodyid[0])
         self._kd: Array = np.broadcast_to(spec.damping, (num_envs, spec.num_joints))
+        self._last_time: Array = np.zeros(num_envs)
+        self._recorder = FlightRecorder(num_envs, self._batch.nstate)
+        self.causes: NDArray[np.int64] = np.zeros(num_envs, dtype=np.int64)
+        """What went wrong with each simulation in the last step, 0 for nothing, shape (n,); see ``CAUSES``."""
         self._batch.reset(keyframe=0)
 
     @property
@@ -56,9 +62,25 @@ class RobotBatch:
         return self._actuator_force - self._kd * self.qvel[:, 6:]
 
     def step(self, targets: Array) -> None:
-        """Advance every simulation by one control step towards PD targets [rad], shape (n, joints)."""
-        self.ctrl[:] = targets
-        self._batch.step(nstep=self._decimation, stage=_VEL)
+        """Advance every simulation by one control step towards PD targets [rad], shape (n, joints).
+
+        A simulation with a target that is not finite keeps the targets it had, and is reported in ``causes``.
+        """
+        wild = ~np.isfinite(targets).all(axis=1)
+        np.copyto(self.ctrl, targets, where=~wild[:, None])
+        warned = self._advance()
+        self._recorder.add(self._batch.state)
+        self.causes = diagnose(self.qpos, self.qvel, self._time > self._last_time, warned, wild)
+        self._last_time[:] = self._time
+
+    def _advance(self) -> NDArray[np.bool_]:
+        """Step; returns the simulations that MuJoCo warned about or refused to step, shape (n,)."""
+        refused = np.zeros(self.num_envs, dtype=np.bool_)
+        try:
+            self._batch.step(nstep=self._decimation, stage=_VEL)
+        except SimulationError as error:
+            refused[error.ids] = True
+        return refused | self._batch.warning[:, :, 1].any(axis=1)
 
     def refresh(self, ids: Ids) -> None:
         """Recompute every derived quantity of some simulations from their state, after it was written."""
@@ -72,6 +94,8 @@ class RobotBatch:
         self._time[ids] = 0.0
         self._warmstart[ids] = 0.0
         self._xfrc[ids] = 0.0
+        self._last_time[ids] = 0.0
+        self._recorder.forget(ids)
         self._batch.warning[ids] = 0
         self.refresh(ids)
 
@@ -116,9 +140,25 @@ class RobotBatch:
         self._batch.expand("body_ipos")[:] = self.model.body_ipos + com_offset
         self._batch.set_const()
 
-    def faults(self) -> NDArray[np.bool_]:
-        """Simulations with a non-finite state or a solver warning since their reset, shape (n,)."""
-        return ~np.isfinite(self._batch.state).all(axis=1) | self._batch.warning[:, :, 1].any(axis=1)
+    def fault(self, env: int) -> Fault:
+        """The last states of a simulation that ``causes`` names."""
+        states = self._recorder.last(env)
+        return Fault(
+            robot=self.spec.name,
+            robot_file=str(self.spec.yaml_path),
+            cause=CAUSES[self.causes[env] - 1],
+            env=env,
+            time=states[:, 0],
+            qpos=states[:, self._state_columns(mujoco.mjtState.mjSTATE_QPOS)],
+            qvel=states[:, self._state_columns(mujoco.mjtState.mjSTATE_QVEL)],
+            ctrl=states[:, self._state_columns(mujoco.mjtState.mjSTATE_CTRL)],
+        )
+
+    def _state_columns(self, component: mujoco.mjtState) -> slice:
+        """Where a component lies in an integration state, whose components are in the order of their bits."""
+        before = mujoco.mjtState.mjSTATE_INTEGRATION.value & (component.value - 1)
+        start = mujoco.mj_stateSize(self.model, before)
+        return slice(start, start + mujoco.mj_stateSize(self.model, component.value))
 
     def state(self) -> Array:
         """A copy of every simulation's integration state, shape (n, nstate)."""
@@ -127,6 +167,8 @@ class RobotBatch:
     def set_state(self, state: Array) -> None:
         """Restore what :meth:`state` returned and recompute the derived quantities."""
         self._batch.state[:] = state
+        self._last_time[:] = self._time
+        self._recorder.forget(slice(None))
         self.refresh(np.arange(self.num_envs))
 
     def snapshot(self, env: int) -> mujoco.MjData:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -31,23 +32,27 @@ class PhysicsPool:
         self.batches = list(batches)
         edges = np.cumsum([0, *(batch.num_envs for batch in batches)]).tolist()
         self.rows = [slice(edges[i], edges[i + 1]) for i in range(len(batches))]
+        self.fault_folder: Path | None = None
+        """Where the last states of sick environments are kept; None keeps none."""
         self.num_envs = edges[-1]
         self.device = device
         self.columns = staging_columns(batches[0].sensordata.shape[1])
         width = self.columns["sensors"].stop
         self._staging = torch.zeros(self.num_envs, width, dtype=dtype, pin_memory=device.type == "cuda")
         self._array = self._staging.numpy()
-        self._gather()
+        for robot in range(len(self.batches)):
+            self._gather_rows(robot, slice(None))
 
     def step(self, targets: Tensor, wrench: Tensor | None = None) -> Tensor:
         """Advance one control step.
 
         Args:
-            targets: canonical PD targets in slots [rad], shape (N, 32).
+            targets: canonical PD targets in slots [rad], shape (N, 32); NaN where the action was absurd.
             wrench: world-frame force [N] and torque [N m] on the bases, shape (N, 6), or None for none.
 
         Returns:
-            The staging array on the learner's device, see :func:`staging_columns`, shape (N, columns); fresh.
+            The staging array on the learner's device, see :func:`staging_columns`, shape (N, columns); fresh. Rows of
+            sick environments stay as they were in the step before, so that nothing that is not finite gets out.
         """
         canonical = targets.to("cpu", torch.float64).numpy()
         forces = None if wrench is None else wrench.to("cpu", torch.float64).numpy()
@@ -55,7 +60,12 @@ class PhysicsPool:
             if forces is not None:
                 batch.apply_base_wrench(forces[rows])
             batch.step(batch.spec.to_native(canonical[rows]))
-        self._gather()
+        for robot, batch in enumerate(self.batches):
+            sick = batch.causes.nonzero()[0]
+            self._gather_rows(robot, np.flatnonzero(batch.causes == 0) if len(sick) else slice(None))
+            if self.fault_folder is not None:
+                for env in sick.tolist():
+                    batch.fault(env).save(self.fault_folder)
         return self.staged()
 
     def staged(self) -> Tensor:
@@ -106,9 +116,9 @@ class PhysicsPool:
         for batch, rows in zip(self.batches, self.rows, strict=True):
             batch.set_base_damping(values[rows])
 
-    def faults(self) -> Tensor:
-        """Environments whose physics went wrong since their reset, bool, shape (N,)."""
-        return torch.from_numpy(np.concatenate([batch.faults() for batch in self.batches])).to(self.device)
+    def causes(self) -> Tensor:
+        """What went wrong with each environment in the last step, 0 for nothing, int64, shape (N,); see ``CAUSES``."""
+        return torch.from_numpy(np.concatenate([batch.causes for batch in self.batches])).to(self.device)
 
     def state_dict(self) -> dict[str, Any]:
         """Physics states and the staging array, which holds what the last substep left behind."""
@@ -122,10 +132,6 @@ class PhysicsPool:
         for batch, saved in zip(self.batches, state["states"], strict=True):
             batch.set_state(saved.numpy())
         self._staging.copy_(state["staging"])
-
-    def _gather(self) -> None:
-        for robot in range(len(self.batches)):
-            self._gather_rows(robot, slice(None))
 
     def _gather_rows(self, robot: int, local: slice | np.ndarray) -> None:
         """Write the staging rows of some simulations of one robot."""

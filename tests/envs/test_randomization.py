@@ -21,9 +21,11 @@ def field(env: HumanoidEnv, name: str) -> Array:
     """A model field of the first robot, per environment, shape (n, ...)."""
     batch = env.pool.batches[0]
     expanded = batch._batch.expanded(name)
-    return np.broadcast_to(getattr(batch.model, name), (batch.num_envs, *getattr(batch.model, name).shape)) if (
-        expanded is None
-    ) else expanded
+    return (
+        np.broadcast_to(getattr(batch.model, name), (batch.num_envs, *getattr(batch.model, name).shape))
+        if (expanded is None)
+        else expanded
+    )
 
 
 def readings(env: HumanoidEnv) -> dict[str, Array]:

@@ -39,20 +39,30 @@ def embodiment(seed: int = 0) -> Tensor:
     return torch.randn(N, EMBODIMENT_DIM, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
+def critic_of(
+    state: PooledState,
+    robots: PooledRobots,
+    o_ea: Tensor | None,
+    cfg: ObservationsCfg = CFG,
+    friction_range: tuple[float, float] = FRICTION,
+) -> Tensor:
+    return critic_observation(proprioception(state, robots, cfg), state, robots, o_ea, cfg, friction_range)
+
+
 def groups(state: PooledState, robots: PooledRobots, o_ea: Tensor, cfg: ObservationsCfg = CFG) -> dict[str, Tensor]:
     """Every observation group, with K copies of the same frame as history."""
     return {
         "history": proprioception(state, robots, cfg).repeat(1, cfg.history_length),
         "command": command_observation(state, cfg),
         "clock": clock(state.foot_phase),
-        "critic": critic_observation(state, robots, o_ea, cfg, FRICTION),
+        "critic": critic_of(state, robots, o_ea, cfg),
         "estimate": estimation_target(state, o_ea, cfg),
         "actions": state.actions,
     }
 
 
 def critic_column(state: PooledState, name: str) -> Tensor:
-    return critic_observation(state, ROBOTS, embodiment(), CFG, FRICTION)[:, LAYOUT.columns("critic", name)]
+    return critic_of(state, ROBOTS, embodiment())[:, LAYOUT.columns("critic", name)]
 
 
 def test_layout_has_the_size_of_every_group() -> None:
@@ -68,7 +78,7 @@ def test_without_embodiment_and_last_action_the_groups_shrink() -> None:
     assert proprioception(state, ROBOTS, cfg).shape[1] == layout.frame_size == 70
     assert noise_scale(cfg, ROBOTS).shape[1] == 70
     assert estimation_target(state, None, cfg).shape[1] == layout.size("estimate") == 3
-    critic = critic_observation(state, ROBOTS, None, cfg, FRICTION)
+    critic = critic_of(state, ROBOTS, None, cfg)
     assert critic.shape[1] == layout.size("critic") == LAYOUT.size("critic") - 32 - EMBODIMENT_DIM
 
 
@@ -93,9 +103,7 @@ def test_each_quantity_moves_its_own_columns_by_its_scale(term: str, source: str
     state = quiet_state(ROBOTS)
     state.foot_phase = torch.zeros_like(state.foot_phase)
     moved = replace(state, **{source: getattr(state, source) + 1e-3})
-    difference = critic_observation(moved, ROBOTS, embodiment(), CFG, FRICTION) - critic_observation(
-        state, ROBOTS, embodiment(), CFG, FRICTION
-    )
+    difference = critic_of(moved, ROBOTS, embodiment()) - critic_of(state, ROBOTS, embodiment())
     columns = LAYOUT.columns("critic", term)
     touched = torch.zeros_like(difference, dtype=torch.bool)
     touched[:, columns] = True
@@ -220,7 +228,7 @@ def test_friction_maps_its_range_to_one_half(friction: float, expected: float) -
 
 
 def test_friction_is_zero_where_it_is_not_randomized() -> None:
-    critic = critic_observation(random_state(0, ROBOTS), ROBOTS, embodiment(), CFG, (1.0, 1.0))
+    critic = critic_of(random_state(0, ROBOTS), ROBOTS, embodiment(), friction_range=(1.0, 1.0))
     assert not critic[:, LAYOUT.columns("critic", "friction")].any()
 
 
