@@ -18,9 +18,11 @@ from eagle_rl.evaluation.evaluate import Policy
 from eagle_rl.models import EagleActor
 from eagle_rl.runners.checkpoint import latest_checkpoint, load_actor, read_manifest, verify_checkpoint
 from eagle_rl.runners.compass import DemonstrationEnv, ResidualBank, ResidualEnv, ResidualPolicy, begin_residual
+from eagle_rl.runners.locate import find_checkpoint
 from eagle_rl.runners.on_policy import EagleRunner, make_train_cfg
 from eagle_rl.runners.plan import Stage, warm_task
 from eagle_rl.runners.provenance import Provenance
+from eagle_rl.runners.published import SUFFIX
 
 MakeEnv = Callable[[Sequence[str], int, TaskCfg, int], Any]
 """Builds an environment from robot names, number of environments, task and seed; picklable for several jobs."""
@@ -118,9 +120,9 @@ def load_policy(job: Job, checkpoint: Path) -> Policy:
 
 def _copy_root(job: Job, checkpoints: Path) -> Path:
     """Take the experiment's root checkpoint into the run, so that the run is complete without it."""
-    source = Path(job.cfg.plan.root or "").with_suffix(".pt")
-    if not source.exists():
-        raise CheckpointError(f"plan.root: {source}: no such checkpoint.")
+    source = find_checkpoint(Path(job.cfg.plan.root or ""))
+    if source.suffix == SUFFIX:
+        raise CheckpointError(f"plan.root: {source}: a published policy has no critic to go on from; use a checkpoint.")
     verify_checkpoint(source)
     checkpoints.mkdir(parents=True, exist_ok=True)
     for suffix in (".pt", ".json"):  # the manifest last: what has one is complete
