@@ -66,7 +66,7 @@ class RobotBatch:
 
         A simulation with a target that is not finite keeps the targets it had, and is reported in ``causes``.
         """
-        wild = ~np.isfinite(targets).all(axis=1)
+        wild = ~np.isfinite(targets.sum(axis=1))
         np.copyto(self.ctrl, targets, where=~wild[:, None])
         warned = self._advance()
         self._recorder.add(self._batch.state)
