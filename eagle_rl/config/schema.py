@@ -406,6 +406,8 @@ class PlanCfg:
     """Budget of each specialist, per round."""
     distill_env_steps: int = 0
     """Budget of each distillation, per round."""
+    base_env_steps: int = 0
+    """Budget of COMPASS's base policy, which imitates the root."""
     max_rounds: int = 1
     """Rounds of specialise and generalise; 1 is the paper's EAGLE, more its "w/ ID"."""
     tolerance: float = 0.01
