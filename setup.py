@@ -80,8 +80,6 @@ setup(
             "mypy>=1.13",
             "types-PyYAML>=6.0",
         ],
-        "viewer": ["viser>=0.2"],
-        "wandb": ["wandb>=0.17"],
     },
     classifiers=[
         "Programming Language :: Python :: 3",

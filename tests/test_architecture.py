@@ -27,10 +27,10 @@ OPEN_TO_ENVS = ("eagle_rl.config", "eagle_rl.errors", "eagle_rl.paths")
 
 OWNERS = {
     "yaml": {"eagle_rl/config/yaml_file.py"},
-    "mujoco": {"envs"},
+    "mujoco": {"envs", "eagle_rl/cli"},
     "pinocchio": {"envs"},
     "envs": {"eagle_rl/cli"},
-    "matplotlib": {"eagle_rl/evaluation"},
+    "matplotlib": {"eagle_rl/evaluation", "eagle_rl/cli/plot.py"},
     "pickle": set(),
 }
 """Packages that only some folders or files may import."""
@@ -39,6 +39,7 @@ OWNERS = {
 NAMES_AS_DATA = {
     "eagle_rl/config/schema.py",  # which robots an experiment has if it names none
     "eagle_rl/evaluation/reference.py",  # the paper's own numbers, robot by robot
+    "envs/gym.py",  # the same for gymnasium
     "envs/robots/embodiment.py",  # the bodies that o_ea is standardised over
 }
 """Files that list robots without treating any of them in a way of its own."""

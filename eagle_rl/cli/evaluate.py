@@ -5,19 +5,19 @@ from __future__ import annotations
 import argparse
 import dataclasses
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from eagle_rl.config.schema import EvaluationCfg, ExperimentCfg
 from eagle_rl.errors import ConfigError
 
+from .policy import Policy, chosen_robots, load_policy
+
 if TYPE_CHECKING:
     from rich.console import Console
 
     from eagle_rl.evaluation.evaluate import EvaluationResult
     from eagle_rl.evaluation.report import Table
-    from eagle_rl.models import EagleActor
 
 METHODS = {
     "ppo": "PPO",
@@ -26,6 +26,7 @@ METHODS = {
     "kickstarting": "Kickstarting",
     "eagle": "EAGLE",
     "eagle_id": "EAGLE w/ ID",
+    "single": "single-robot PPO",
 }
 """The paper's name for each of its experiments."""
 
@@ -37,7 +38,7 @@ def _parser() -> argparse.ArgumentParser:
         epilog="Example: eagle evaluate PPO=logs/ppo/RUN EAGLE=logs/eagle/RUN1 EAGLE=logs/eagle/RUN2 --out results",
     )
     parser.add_argument("checkpoints", nargs="+", metavar="[NAME=]CKPT", help="checkpoint, stage, run, or result .json")
-    parser.add_argument("--robots", metavar="A,B", help="robots to judge on [those it was trained on]")
+    parser.add_argument("--robots", metavar="A,B", help="robots to judge on, or all [those it was trained on]")
     parser.add_argument("--envs", type=int, metavar="N", help="environments per robot [the experiment's]")
     parser.add_argument("--steps", type=int, metavar="N", help="control steps [the experiment's, 1000 in the paper]")
     parser.add_argument("--protocol", choices=("single", "joint"), help="draw one command at a time, or all five")
@@ -51,18 +52,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--falls", choices=("charged", "errors"), default="charged", help="charge |c_d| after a fall, or stop"
     )
+    parser.add_argument("--device", default="cpu", metavar="cpu|cuda", help="where the policy computes [cpu]")
     parser.add_argument("--out", type=Path, metavar="DIR", help="write results and table.{md,csv,tex,json} here")
     return parser
-
-
-@dataclass(frozen=True)
-class _Candidate:
-    """One policy to judge."""
-
-    method: str
-    actor: EagleActor
-    sha256: str
-    cfg: ExperimentCfg
 
 
 def _split(word: str) -> tuple[str | None, Path]:
@@ -71,16 +63,9 @@ def _split(word: str) -> tuple[str | None, Path]:
     return (name, Path(path)) if equals else (None, Path(word))
 
 
-def _candidate(name: str | None, path: Path) -> _Candidate:
-    from eagle_rl.config.load import experiment_from_plain
-    from eagle_rl.runners.checkpoint import load_actor
-    from eagle_rl.runners.locate import find_checkpoint
-
-    checkpoint = find_checkpoint(path)
-    actor, manifest = load_actor(checkpoint)
-    cfg = experiment_from_plain(manifest["config"], str(checkpoint))
-    method = name or METHODS.get(cfg.name, cfg.name)
-    return _Candidate(method, actor.to(cfg.run.device), manifest["sha256"], cfg)
+def _method(cfg: ExperimentCfg) -> str:
+    """The paper's name for an experiment, or its own."""
+    return METHODS.get("single" if len(cfg.robots) == 1 and cfg.plan.method == "ppo" else cfg.name, cfg.name)
 
 
 def _protocol(ev: EvaluationCfg, args: argparse.Namespace) -> EvaluationCfg:
@@ -97,23 +82,20 @@ def _protocol(ev: EvaluationCfg, args: argparse.Namespace) -> EvaluationCfg:
     return dataclasses.replace(ev, **{key: value for key, value in asked.items() if value is not None})
 
 
-def _judge(candidate: _Candidate, ev: EvaluationCfg, robots: str | None, console: Console) -> EvaluationResult:
-    """Evaluate one checkpoint, with progress."""
-    import torch
+def _judge(name: str, policy: Policy, ev: EvaluationCfg, robots: Sequence[str], console: Console) -> EvaluationResult:
+    """Evaluate one policy, with progress."""
     from rich.progress import Progress
 
     from eagle_rl.evaluation.evaluate import EvaluationResult, evaluate
 
     from .environment import make_env_factory
 
-    cfg = candidate.cfg
-    names = tuple(robots.split(",")) if robots and robots != "all" else cfg.robots
-    torch.set_num_threads(cfg.run.torch_threads)
+    cfg = policy.cfg
     make_env = make_env_factory(cfg.run)
     with Progress(console=console, transient=True) as progress:
-        bar = progress.add_task(candidate.method, total=len(names) * ev.num_envs_per_robot * ev.num_steps)
-        scores = evaluate(candidate.actor, make_env, names, cfg.task, ev, on_step=lambda n: progress.advance(bar, n))
-    return EvaluationResult(checkpoint=candidate.sha256, protocol=ev, robots=scores, seed=cfg.seed)
+        bar = progress.add_task(name, total=len(robots) * ev.num_envs_per_robot * ev.num_steps)
+        scores = evaluate(policy.actor, make_env, robots, cfg.task, ev, on_step=lambda n: progress.advance(bar, n))
+    return EvaluationResult(checkpoint=policy.sha256, protocol=ev, robots=scores, seed=cfg.seed)
 
 
 def main(argv: Sequence[str]) -> int:
@@ -135,9 +117,10 @@ def main(argv: Sequence[str]) -> int:
         if _is_result(path):
             method, result = name or path.stem, EvaluationResult.read(path)
         else:
-            candidate = _candidate(name, path)
-            method, ev = candidate.method, _protocol(candidate.cfg.evaluation, args)
-            result = _judge(candidate, ev, args.robots, console)
+            policy = load_policy(path, args.device)
+            method = name or _method(policy.cfg)
+            ev = _protocol(policy.cfg.evaluation, args)
+            result = _judge(method, policy, ev, chosen_robots(args.robots, policy.cfg), console)
         results.setdefault(method, []).append(result)
     table = tracking_table(results, args.subset, args.falls)
     print(to_markdown(table))

@@ -15,7 +15,7 @@ from eagle_rl.errors import EagleError, did_you_mean
 
 VERBS: dict[str, str] = {
     "train": "run an experiment into a run directory, or resume one",
-    "play": "show a checkpoint: window or video",
+    "play": "show a checkpoint: browser, window or video",
     "evaluate": "tracking errors and survival of checkpoints: the paper's table",
     "plot": "figures from runs: curves, latents, rounds",
     "export": "a checkpoint as ONNX with its input/output contract",

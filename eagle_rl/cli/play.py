@@ -1,4 +1,4 @@
-"""``eagle play``: a checkpoint in motion, several robots side by side, in a window or as a video."""
+"""``eagle play``: a checkpoint in motion, several robots side by side, in a browser, a window or as a video."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import argparse
 import contextlib
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,9 +16,6 @@ from eagle_rl.config.validate import CONTROL_STEP
 from eagle_rl.errors import CheckpointError, ConfigError
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from .session import Session
 
 SHEET_FRAMES = 12
@@ -39,8 +36,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--robots", metavar="A,B|all", help="robots to show [those it was trained on]")
     parser.add_argument(
         "--viewer",
-        choices=("native", "none"),
-        help="native opens a window [if there is a display and no file is asked for]",
+        choices=("web", "native", "none"),
+        help="web serves browsers, native opens a window [native if there is a display and no file is asked for]",
     )
     parser.add_argument("--video", type=Path, metavar="FILE.mp4", help="write a video")
     parser.add_argument("--contact-sheet", type=Path, metavar="FILE.png", help="write twelve frames as one picture")
@@ -114,16 +111,29 @@ def main(argv: Sequence[str]) -> int:
             check_writable(path, suffix)
 
     checkpoint = find_checkpoint(args.checkpoint or newest_run())
-    if viewer == "native":
-        from .window import watch
-
-        session = _load(args, checkpoint, args.seconds or 1e6)
-        watch(session, script if args.commands else None, args.seconds)
-    else:
+    if viewer == "none":
         seconds = args.seconds or script.duration
         video = args.video if files else checkpoint.with_suffix(".mp4")
         film(_load(args, checkpoint, seconds), script, seconds, video, args.contact_sheet)
+    else:
+        watch = _viewer(viewer)
+        watch(_load(args, checkpoint, args.seconds or 1e6), script if args.commands else None, args.seconds)
     return 0
+
+
+def _viewer(kind: str) -> Callable[[Session, CommandScript | None, float | None], None]:
+    """The function that shows a session live."""
+    if kind == "native":
+        from .window import watch
+
+        return watch
+    try:
+        from .browser import serve
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            f"--viewer web needs {error.name}: pip install viser. Or make a video: --video robots.mp4"
+        ) from error
+    return serve
 
 
 def film(session: Session, script: CommandScript, seconds: float, video: Path | None, sheet: Path | None) -> None:
@@ -134,6 +144,8 @@ def film(session: Session, script: CommandScript, seconds: float, video: Path | 
     from envs.rendering.offscreen import OffscreenRenderer
     from envs.rendering.recorder import captioned, contact_sheet, evenly, save_picture, video_writer
     from envs.rendering.scene import Stage
+
+    from .session import caption
 
     num_steps = max(1, round(seconds / session.step_dt))
     picks = set(evenly(num_steps, SHEET_FRAMES)) if sheet is not None else set()
@@ -158,13 +170,6 @@ def film(session: Session, script: CommandScript, seconds: float, video: Path | 
     if sheet is not None:
         save_picture(sheet, contact_sheet(picked))
     _report(session, [path for path in (video, sheet) if path is not None])
-
-
-def caption(time: float, command: NDArray[np.float64]) -> str:
-    """Time and command in words."""
-    vx, vy, wz, h, p = command
-    walk = f"forward {vx:+.2f} m/s   left {vy:+.2f} m/s   turn {wz:+.2f} rad/s"
-    return f"{time:5.1f} s    {walk}   height {h:+.2f} m   pitch {p:+.2f} rad"
 
 
 def _report(session: Session, files: Sequence[Path]) -> None:

@@ -9,12 +9,12 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from eagle_rl.config.schema import ExperimentCfg
 from eagle_rl.errors import ConfigError
+
+from .policy import chosen_robots, load_policy
 
 if TYPE_CHECKING:
     from eagle_rl.evaluation.plots import Figure
-    from eagle_rl.models import EagleActor
 
 FIGURES = {
     "curves": "learning curves per robot of a run's stages",
@@ -39,7 +39,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--out", type=Path, default=Path("figures"), metavar="DIR", help="folder of the figures [figures]"
     )
-    parser.add_argument("--robots", metavar="A,B", help="robots to show [those it was trained on]")
+    parser.add_argument("--robots", metavar="A,B", help="robots to show, or all [those it was trained on]")
+    parser.add_argument("--device", default="cpu", metavar="cpu|cuda", help="where the policy computes [cpu]")
     parser.add_argument("--envs", type=int, default=16, metavar="N", help="environments per robot [16]")
     parser.add_argument("--steps", type=int, default=500, metavar="N", help="control steps of robustness runs [500]")
     parser.add_argument("--smooth", type=int, default=10, metavar="N", help="iterations averaged in curves [10]")
@@ -50,25 +51,6 @@ def _named(word: str) -> tuple[str, Path]:
     """``NAME=PATH``, or a path that names itself."""
     name, equals, path = word.partition("=")
     return (name, Path(path)) if equals else (Path(word).name, Path(word))
-
-
-def _load(path: Path) -> tuple[EagleActor, ExperimentCfg]:
-    """Policy and experiment of a checkpoint."""
-    import torch
-
-    from eagle_rl.config.load import experiment_from_plain
-    from eagle_rl.runners.checkpoint import load_actor
-    from eagle_rl.runners.locate import find_checkpoint
-
-    checkpoint = find_checkpoint(path)
-    actor, manifest = load_actor(checkpoint)
-    cfg = experiment_from_plain(manifest["config"], str(checkpoint))
-    torch.set_num_threads(cfg.run.torch_threads)
-    return actor, cfg
-
-
-def _robots(args: argparse.Namespace, cfg: ExperimentCfg) -> tuple[str, ...]:
-    return tuple(args.robots.split(",")) if args.robots else cfg.robots
 
 
 def _curves(args: argparse.Namespace) -> dict[str, Figure]:
@@ -109,9 +91,10 @@ def _latents(args: argparse.Namespace) -> dict[str, Figure]:
 
     maps, numbers = {}, {}
     for name, path in map(_named, args.paths):
-        actor, cfg = _load(path)
-        make_env, robots = make_env_factory(cfg.run), _robots(args, cfg)
-        found = latents.collect_embeddings(actor, make_env, robots, cfg.task, cfg.evaluation, num_envs=args.envs)
+        policy = load_policy(path, args.device)
+        cfg, robots = policy.cfg, chosen_robots(args.robots, policy.cfg)
+        make_env = make_env_factory(cfg.run)
+        found = latents.collect_embeddings(policy.actor, make_env, robots, cfg.task, cfg.evaluation, num_envs=args.envs)
         scores = latents.silhouette(found), latents.probe_accuracy(found)
         maps[name] = (found, latents.tsne(found), *scores)
         numbers[name] = dict(zip(("silhouette", "linear_probe_accuracy"), scores, strict=True))
@@ -127,8 +110,9 @@ def _response(args: argparse.Namespace) -> dict[str, Figure]:
 
     figures = {}
     for name, path in map(_named, args.paths):
-        actor, cfg = _load(path)
-        traces = command_responses(actor, make_env_factory(cfg.run), _robots(args, cfg), cfg.task, cfg.evaluation)
+        policy = load_policy(path, args.device)
+        cfg, robots = policy.cfg, chosen_robots(args.robots, policy.cfg)
+        traces = command_responses(policy.actor, make_env_factory(cfg.run), robots, cfg.task, cfg.evaluation)
         figures[name] = plots.responses(traces)
     return figures
 
@@ -141,13 +125,14 @@ def _robustness(args: argparse.Namespace) -> dict[str, Figure]:
 
     figures = {}
     for name, path in map(_named, args.paths):
-        actor, cfg = _load(path)
+        policy = load_policy(path, args.device)
+        cfg, robots = policy.cfg, chosen_robots(args.robots, policy.cfg)
         ev = dataclasses.replace(cfg.evaluation, num_envs_per_robot=args.envs, num_steps=args.steps)
-        make_env, robots = make_env_factory(cfg.run), _robots(args, cfg)
-        scores = {kind: sweep(actor, make_env, robots, cfg.task, ev, kind) for kind in SWEEPS}
+        make_env = make_env_factory(cfg.run)
+        scores = {kind: sweep(policy.actor, make_env, robots, cfg.task, ev, kind) for kind in SWEEPS}
         figures[name] = plots.robustness((SWEEPS[kind], scores[kind]) for kind in SWEEPS)
         plain = {
-            kind: {str(v): {r: dataclasses.asdict(m) for r, m in robots.items()} for v, robots in by_value.items()}
+            kind: {str(v): {r: dataclasses.asdict(m) for r, m in scored.items()} for v, scored in by_value.items()}
             for kind, by_value in scores.items()
         }
         _write_numbers(args.out / f"robustness_{name}.json", plain)

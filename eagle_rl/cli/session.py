@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from eagle_rl.config.schema import ExperimentCfg
+from eagle_rl.config.schema import ExperimentCfg, TerrainCfg
 from eagle_rl.evaluation.protocol import evaluation_task
 from envs.humanoid_env import HumanoidEnv
 from envs.robots.load import load_robot
@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 
 class Session:
-    """Robots under one deterministic policy and one command, in the task as it is evaluated.
+    """Robots under one deterministic policy and one command, in the task as it is evaluated, on flat ground.
 
     A robot that falls starts again where it began.
 
@@ -38,7 +38,7 @@ class Session:
         self.cfg = cfg
         self.specs = [load_robot(name) for name in robots]
         protocol = dataclasses.replace(cfg.evaluation, num_steps=num_steps, randomization=False, noise=False)
-        task = evaluation_task(cfg.task, protocol)
+        task = dataclasses.replace(evaluation_task(cfg.task, protocol), terrain=TerrainCfg())
         self._env = HumanoidEnv(task, self.specs, len(self.specs), protocol.seed, num_threads=1)
         self._actor = actor
         self.step_dt = self._env.step_dt
@@ -64,3 +64,10 @@ class Session:
         self.num_steps += 1
         for row in dones.nonzero().flatten().tolist():
             self.falls[self.specs[row].name].append(self.time)
+
+
+def caption(time: float, command: Array) -> str:
+    """Time and command in words."""
+    vx, vy, wz, h, p = command
+    walk = f"forward {vx:+.2f} m/s   left {vy:+.2f} m/s   turn {wz:+.2f} rad/s"
+    return f"{time:5.1f} s    {walk}   height {h:+.2f} m   pitch {p:+.2f} rad"

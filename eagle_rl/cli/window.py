@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
+import threading
 import time
-from typing import NamedTuple
+from collections.abc import Iterator
+from typing import Any, NamedTuple
 
+import mujoco
 import mujoco.viewer
 import numpy as np
 from numpy.typing import NDArray
 
 from eagle_rl.config.commands import COMMAND_KEYS, CommandScript
 from eagle_rl.config.schema import CommandsCfg
-from envs.rendering.scene import Stage
+from envs.rendering.offscreen import RenderingError
+from envs.rendering.scene import FollowCamera, Stage
 
-from .session import Session
+from .session import Session, caption
 
 Array = NDArray[np.float64]
 
@@ -76,17 +81,42 @@ def watch(session: Session, script: CommandScript | None, seconds: float | None)
         session: the robots.
         script: what to command, over and over, or None for the keyboard.
         seconds: stop after so long, or None.
+
+    Raises:
+        RenderingError: no window can be opened.
     """
     keyboard = Keyboard(session.cfg.task.commands)
     stage = Stage(session.specs)
     if script is None:
         print(help_text())
-    with mujoco.viewer.launch_passive(stage.model, stage.data, key_callback=keyboard.press) as viewer:
+    with _open_window(stage, keyboard) as viewer:
+        fovy = float(stage.model.vis.global_.fovy)
+        camera = FollowCamera(viewer.cam, len(session.specs), 16 / 9, fovy)
         start = time.monotonic()
         while viewer.is_running() and (seconds is None or session.time < seconds):
             command = keyboard.command if script is None else script.at(session.time % script.duration)
             session.step(command)
             with viewer.lock():
                 stage.pose(session.qpos)
+                camera.follow(stage.root_positions())
+            viewer.set_texts((None, mujoco.mjtGridPos.mjGRID_TOPLEFT, caption(session.time, command), ""))
             viewer.sync()
             time.sleep(max(0.0, start + session.time - time.monotonic()))
+
+
+@contextlib.contextmanager
+def _open_window(stage: Stage, keyboard: Keyboard) -> Iterator[Any]:
+    """MuJoCo's viewer; its thread is waited for, because leaving Python while it draws crashes."""
+    others = set(threading.enumerate())
+    try:
+        viewer = mujoco.viewer.launch_passive(
+            stage.model, stage.data, key_callback=keyboard.press, show_left_ui=False, show_right_ui=False
+        )
+    except RuntimeError as error:
+        raise RenderingError(f"no window can be opened: {error}. Make a video: --video robots.mp4") from error
+    try:
+        yield viewer
+    finally:
+        viewer.close()
+        for thread in set(threading.enumerate()) - others:
+            thread.join(timeout=5.0)

@@ -12,7 +12,7 @@ from eagle_rl.errors import ConfigError
 from eagle_rl.evaluation.evaluate import EvaluationResult
 from eagle_rl.evaluation.metrics import RobotMetrics
 from eagle_rl.evaluation.protocol import COMMANDS
-from eagle_rl.evaluation.reference import FLOORS, PAPER, STAND_STILL, Errors
+from eagle_rl.evaluation.reference import FLOORS, PAPER, PAPER_H1, STAND_STILL, Errors
 
 Falls = Literal["charged", "errors"]
 """``charged`` counts |c_d| for every step after a fall, ``errors`` leaves those steps out."""
@@ -96,7 +96,7 @@ def tracking_table(
     results: Mapping[str, Sequence[EvaluationResult]],
     subset: str = "all",
     falls: Falls = "charged",
-    paper: Mapping[str, Mapping[str, Errors]] = PAPER,
+    paper: Mapping[str, Mapping[str, Errors]] = {**PAPER, **PAPER_H1},
 ) -> Table:
     """Gather results into a table.
 

@@ -82,7 +82,7 @@ class OffscreenRenderer:
         self.stage = stage
         self.width, self.height = width, height
         fovy = float(stage.model.vis.global_.fovy)
-        self.camera = FollowCamera(camera or CameraCfg(), len(stage.names), width / height, fovy)
+        self.camera = FollowCamera(mujoco.MjvCamera(), len(stage.names), width / height, fovy, camera)
         self._context = open_context(width, height)
         self._context.make_current()
         self._scene = mujoco.MjvScene(stage.model, maxgeom=4000)

@@ -91,13 +91,16 @@ class Stage:
 
 
 class FollowCamera:
-    """A free camera that glides after the middle of the robots."""
+    """Points a MuJoCo camera at the robots and glides after their middle."""
 
-    def __init__(self, cfg: CameraCfg, num_robots: int, aspect: float, fovy_deg: float) -> None:
+    def __init__(
+        self, camera: mujoco.MjvCamera, num_robots: int, aspect: float, fovy_deg: float, cfg: CameraCfg | None = None
+    ) -> None:
         """Stand back far enough to see ``num_robots`` lanes in a picture of the given aspect ratio."""
-        self.camera = mujoco.MjvCamera()
-        self.camera.azimuth, self.camera.elevation = cfg.azimuth_deg, cfg.elevation_deg
-        self.camera.distance = cfg.margin * _distance(num_robots, aspect, fovy_deg)
+        cfg = cfg or CameraCfg()
+        self.camera = camera
+        camera.azimuth, camera.elevation = cfg.azimuth_deg, cfg.elevation_deg
+        camera.distance = cfg.margin * _distance(num_robots, aspect, fovy_deg)
         self._height = cfg.height
         self._centre: Array | None = None
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import sys
+
 import imageio_ffmpeg
 import numpy as np
 import pytest
 from PIL import Image
 
 from eagle_rl.cli import export, play, sim2sim
-from eagle_rl.cli.play import caption
+from eagle_rl.cli.session import caption
 from eagle_rl.cli.window import KEYS, STOP, Keyboard
 from eagle_rl.config.schema import CommandsCfg
 from eagle_rl.errors import CheckpointError, ConfigError, RobotError
@@ -72,6 +74,22 @@ def test_without_a_checkpoint_the_newest_run_is_shown_and_none_is_said_so(tmp_pa
     for name in ("old", "new"):
         untrained_checkpoint(tmp_path / "logs" / "ppo" / name / "stages" / "generalist" / "checkpoints", "h1")
     assert play.newest_run().name == "new"
+
+
+def test_without_viser_the_browser_view_says_what_to_install(checkpoint, monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    monkeypatch.delitem(sys.modules, "eagle_rl.cli.browser", raising=False)
+    with pytest.raises(ConfigError, match="pip install"):
+        play.main([str(checkpoint), "--viewer", "web"])
+
+
+def test_the_browser_gets_every_visible_shape_and_follows_the_script(checkpoint, tmp_path, capsys):
+    pytest.importorskip("viser", reason="viser, the extra for the browser view, is not installed")
+    script = tmp_path / "walk.yaml"
+    script.write_text("- {t: 0, vx: 0.5}\n")
+    words = [str(checkpoint), "--viewer", "web", "--seconds", "0.3", "--commands", str(script)]
+    assert play.main(words) == 0
+    assert "http://localhost" in capsys.readouterr().out
 
 
 def test_a_caption_names_all_five_commands():

@@ -66,7 +66,9 @@ def test_doctor_finds_data_and_folder_in_order():
 
 
 def test_doctor_names_a_package_that_is_too_old(monkeypatch):
-    monkeypatch.setattr(doctor, "requires", lambda name: ["numpy>=999", "no-such-package", "viser; extra == 'viewer'"])
+    monkeypatch.setattr(
+        doctor, "requires", lambda name: ["numpy>=999", "no-such-package", "hypothetical; extra == 'dev'"]
+    )
     findings = doctor.check_packages()
     assert [(f.name, f.state) for f in findings] == [("numpy", "FAIL"), ("no-such-package", "FAIL")]
     assert "needs >=999" in findings[0].detail

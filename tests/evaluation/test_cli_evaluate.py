@@ -11,7 +11,9 @@ from eagle_rl.cli.evaluate import main
 from eagle_rl.config.load import load_experiment
 from eagle_rl.errors import ConfigError
 from eagle_rl.evaluation.evaluate import EvaluationResult
+from eagle_rl.runners.provenance import Provenance, slot_table_hash
 from eagle_rl.runners.stages import run_experiment
+from envs.robots.slots import SLOT_NAMES
 
 QUICK = ["--envs", "2", "--steps", "10"]
 
@@ -20,7 +22,8 @@ QUICK = ["--envs", "2", "--steps", "10"]
 def run(tmp_path_factory):
     """The smoke experiment's generalist on one robot."""
     cfg = load_experiment("smoke", ["robots=[h1]", "plan.method=ppo", "plan.judge_envs_per_robot=0", "seed=7"])
-    return run_experiment(cfg, tmp_path_factory.mktemp("run"), make_env_factory(cfg.run))
+    provenance = Provenance(slot_table_hash=slot_table_hash(SLOT_NAMES))
+    return run_experiment(cfg, tmp_path_factory.mktemp("run"), make_env_factory(cfg.run), provenance=provenance)
 
 
 def test_a_run_becomes_a_table_with_hash_protocol_and_seed(run, tmp_path, capsys):
@@ -40,9 +43,17 @@ def test_stored_results_are_tabled_without_simulating_again(run, tmp_path, capsy
     assert capsys.readouterr().out == first
 
 
-def test_a_checkpoint_is_named_after_its_experiment_unless_told_otherwise(run, tmp_path):
+def test_a_policy_of_one_robot_is_the_papers_single_robot_ppo_unless_told_otherwise(run, tmp_path, capsys):
     main([str(run.generalist), *QUICK, "--out", str(tmp_path)])
-    assert json.loads((tmp_path / "table.json").read_text())["checkpoints"].keys() == {"smoke"}
+    assert json.loads((tmp_path / "table.json").read_text())["checkpoints"].keys() == {"single-robot PPO"}
+    assert "[0.067]" in capsys.readouterr().out, "the number of the paper's H1 table"
+
+
+def test_a_policy_can_be_judged_on_robots_it_has_never_seen(run, capsys):
+    assert main([f"PPO={run.run_dir}", *QUICK, "--robots", "g1"]) == 0
+    out = capsys.readouterr().out
+    assert "| g1 | PPO |" in out
+    assert "| h1 |" not in out
 
 
 def test_an_unknown_subset_is_refused(run):

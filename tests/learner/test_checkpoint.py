@@ -210,6 +210,7 @@ print(newest)
 """
 
 
+@pytest.mark.slow
 def test_a_save_loop_killed_at_50_random_moments_never_loses_a_checkpoint(tmp_path):
     done = subprocess.run(
         [sys.executable, "-c", SAVER, str(tmp_path)], cwd=ROOT, capture_output=True, text=True, timeout=120, check=False

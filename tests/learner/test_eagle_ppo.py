@@ -94,6 +94,7 @@ def test_the_gradient_of_update_is_that_of_a_hand_written_sum_of_all_losses():
     runner = make_runner(
         **ONE_STEP, mirror_fraction=1.0, max_grad_norm=1e9, learning_rate=0.0, entropy_coef=0.01, action_loss_coef=0.3
     )
+    runner.env.mask[::3, 2] = 0.0  # a robot that is not its own mirror image
     bank = with_specialists(runner)
     with_specialists(runner, "kickstart")
     runner.alg.num_updates = 50
@@ -144,10 +145,41 @@ def test_the_learning_rate_moves_once_an_iteration_inside_its_range(desired_kl, 
 
 
 def test_a_policy_that_does_not_move_keeps_its_learning_rate():
-    runner = make_runner(learning_rate=0.0, learning_rate_range=(0.0, 1.0))
+    runner = make_runner(use_ppo_loss=False, estimation_coef=0.0, mirror_coef=0.0)
     collect(runner)
     assert runner.alg.update()["Loss/kl"] == 0.0
-    assert runner.alg.learning_rate == 0.0
+    assert runner.alg.learning_rate == runner.alg.cfg.learning_rate
+
+
+def test_the_learning_rate_follows_the_kl_of_the_last_epoch():
+    runner = make_runner(num_learning_epochs=2, num_mini_batches=1)
+    collect(runner)
+    assert runner.alg.update()["Loss/kl"] > 0.0, "the KL of the first epoch, before any step, is zero"
+
+
+@pytest.mark.parametrize(("kl", "factor"), [(0.0, 1), (0.004, 1.5), (0.006, 1), (0.019, 1), (0.021, 1 / 1.5)])
+def test_the_learning_rate_is_kept_while_the_kl_is_within_a_factor_of_two_of_its_target(kl, factor):
+    alg = make_runner(desired_kl=0.01).alg
+    alg._adapt_learning_rate(kl)
+    assert alg.learning_rate == pytest.approx(alg.cfg.learning_rate * factor)
+
+
+def test_the_mirror_loss_is_computed_on_its_share_of_a_minibatch(monkeypatch):
+    runner = make_runner(**ONE_STEP, mirror_fraction=0.25)
+    rows = []
+    mean_actions = runner.alg.actor.mean_actions
+    monkeypatch.setattr(runner.alg.actor, "mean_actions", lambda *x: rows.append(len(x[0])) or mean_actions(*x))
+    collect(runner)
+    runner.alg.update()
+    assert rows == [8 * 24 // 4]
+
+
+def test_the_learned_std_stays_inside_its_range():
+    runner = make_runner(entropy_coef=10.0, learning_rate=0.1, learning_rate_range=(0.1, 0.1))
+    collect(runner)
+    runner.alg.update()
+    std = runner.alg.actor.distribution.std_param
+    assert std.max() == runner.alg.actor.distribution.std_range[1]
 
 
 @pytest.mark.parametrize("poison", [math.nan, math.inf, -math.inf, 1e30])
@@ -174,6 +206,13 @@ def test_three_gradients_in_a_row_that_are_not_finite_stop_the_run():
     assert all(torch.equal(x, before[key]) for key, x in parameters(runner).items())
 
 
+def test_gradients_that_are_not_finite_now_and_then_do_not_stop_the_run():
+    runner = make_runner(num_learning_epochs=4, num_mini_batches=4)
+    collect(runner)
+    runner.alg.storage.returns[0, 0] = math.nan
+    assert runner.alg.update()["Health/skipped_updates"] == 4.0
+
+
 def test_each_row_is_labelled_by_the_specialist_of_its_robot(monkeypatch):
     monkeypatch.setattr(specialists_module, "CHUNK_ROWS", 7)  # several chunks, the last one short
     runner = make_runner()
@@ -198,6 +237,7 @@ def test_specialists_are_frozen():
     bank = with_specialists(runner)
     before = [copy.deepcopy(actor.state_dict()) for actor in bank]
     runner.learn(2)
+    assert not any(p.requires_grad for actor in runner.alg.specialists.specialists for p in actor.parameters())
     for actor, state in zip(bank, before, strict=True):
         assert all(torch.equal(x, state[key]) for key, x in actor.state_dict().items())
 

@@ -328,6 +328,19 @@ torch.save(parameters(runner), f"{sys.argv[1]}/rank{rank}.pt")
 """
 
 
+@pytest.mark.slow
+def test_another_process_learns_the_same_bits_and_another_seed_others(tmp_path):
+    code = PROCESS.replace("seed=rank)", "seed=0)")
+    subprocess.run([sys.executable, "-c", code, str(tmp_path), "0"], cwd=ROOT, check=True, capture_output=True)
+    there = torch.load(tmp_path / "rank0.pt", weights_only=True)
+    for seed in (1, 2):
+        here = make_runner(env=ToyEnv(12, seed=0), seed=seed)
+        here.learn(2)
+        same = [torch.equal(x, there[key]) for key, x in parameters(here).items()]
+        assert all(same) if seed == 1 else not any(same), f"seed {seed}: {same}"
+
+
+@pytest.mark.slow
 def test_two_processes_train_one_policy(tmp_path):
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))

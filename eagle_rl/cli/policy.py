@@ -1,0 +1,51 @@
+"""A trained policy, ready to be judged."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from eagle_rl.config.compose import known_names
+from eagle_rl.config.schema import ExperimentCfg
+from eagle_rl.errors import ConfigError
+
+if TYPE_CHECKING:
+    from eagle_rl.models import EagleActor
+
+
+@dataclass(frozen=True)
+class Policy:
+    """A policy and where it comes from."""
+
+    actor: EagleActor
+    cfg: ExperimentCfg
+    """The experiment it was trained in, to be run on the device asked for."""
+    sha256: str
+    """Of its checkpoint."""
+
+
+def load_policy(path: Path, device: str = "cpu") -> Policy:
+    """The policy a path means; on another device than it was trained on, if asked."""
+    import torch
+
+    from eagle_rl.config.load import experiment_from_plain
+    from eagle_rl.runners.checkpoint import load_actor
+    from eagle_rl.runners.locate import find_checkpoint
+    from eagle_rl.runners.provenance import slot_table_hash
+    from envs.robots.slots import SLOT_NAMES
+
+    checkpoint = find_checkpoint(path)
+    actor, manifest = load_actor(checkpoint, device, slot_table_hash(SLOT_NAMES))
+    cfg = experiment_from_plain(manifest["config"], str(checkpoint))
+    torch.set_num_threads(cfg.run.torch_threads)
+    return Policy(actor, dataclasses.replace(cfg, run=dataclasses.replace(cfg.run, device=device)), manifest["sha256"])
+
+
+def chosen_robots(text: str | None, cfg: ExperimentCfg) -> tuple[str, ...]:
+    """Robots named on the command line, ``all``, or those of the experiment."""
+    names = tuple(known_names("robots")) if text == "all" else tuple(text.split(",")) if text else cfg.robots
+    if len(set(names)) < len(names):
+        raise ConfigError(f"--robots {text}: a robot is named twice.")
+    return names
