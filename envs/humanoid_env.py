@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -122,8 +122,9 @@ class HumanoidEnv(VecEnv):
         self.step_log = StepLog(self.robot_names, robot_id)
         self._all = torch.arange(num_envs, device=self.device)
         self._allocate(dtype)
-        self._set_harness_damping()
+        self._apply_aids()
         self._reset(self._all)
+        self._no_observations = self.get_observations()[:0].clone()
 
     def _allocate(self, dtype: torch.dtype) -> None:
         """Buffers that outlive a step."""
@@ -131,16 +132,15 @@ class HumanoidEnv(VecEnv):
         self.common_step_counter = 0
         self.episode_length_buf = torch.zeros(n, dtype=torch.long, device=device)
         self.episode_count = torch.zeros(n, dtype=torch.long, device=device)
-        self.step_count = torch.zeros(n, dtype=torch.long, device=device)
         self.phase = torch.zeros(n, dtype=dtype, device=device)
         zeros = torch.zeros(n, NUM_SLOTS, dtype=dtype, device=device)
         self._actions, self._last_actions, self._last_last_actions = zeros, zeros, zeros
         self._last_joint_vel = zeros
         self._last_contact = torch.zeros(n, 2, dtype=torch.bool, device=device)
-        self.state = self._derive(self.pool.staged())
-        frame = proprioception(self.state, self.robots, self.task.observations)
-        self._last_frame = frame
-        self.history = History(n, self.task.observations.history_length, frame)
+        self._staged = self.pool.staged()
+        self.state = self._derive()
+        self._last_frame = proprioception(self.state, self.robots, self.task.observations)
+        self.history = History(n, self.task.observations.history_length, self._last_frame)
 
     # --- the step -----------------------------------------------------------------------------------------------------
 
@@ -155,21 +155,19 @@ class HumanoidEnv(VecEnv):
             Observations after resets, rewards (N,), dones (N,), and extras with ``time_outs``, ``log``, and the true
             last observations of the environments that timed out (``final_ids``, ``final_observations``).
         """
-        targets = self._act(actions)
-        self.randomizer.push(self.step_count, self.penalty_scale, self.step_dt)
-        staged = self.pool.step(targets, self._harness())
+        self._last_joint_vel, self._last_contact = self.state.joint_vel, self.state.foot_contact
+        self._physics_step(self._act(actions))
         self.common_step_counter += 1
         self.episode_length_buf = self.episode_length_buf + 1
-        self.step_count += 1
         self.phase = advance_phase(self.phase, self.step_dt, self.task.gait)
 
         causes = self.pool.causes()
         sick = causes > 0
-        self.state = self._derive(staged)
+        self.state = self._derive()
         reasons = terminations(self.state, self.task.terminations)
         fallen = torch.stack(list(reasons.values())).any(dim=0) & ~sick
         over = (self.episode_length_buf >= self.max_episode_length) | self.ground.left(self.state.root_pos_w)
-        time_outs = over & ~fallen & ~sick
+        time_outs = over & ~(fallen | sick)
         dones = fallen | sick | time_outs
         rewards, terms = self._rewards(fallen)
         rewards = rewards.masked_fill(sick, 0.0)
@@ -177,13 +175,13 @@ class HumanoidEnv(VecEnv):
         self._observe()
         final_ids = (dones if self.final_observations_of_falls else time_outs).nonzero().squeeze(1)
         extras: dict[str, Any] = {"time_outs": time_outs, "final_ids": final_ids}
-        extras["final_observations"] = self._groups(final_ids)
+        extras["final_observations"] = self.get_observations()[final_ids] if len(final_ids) else self._no_observations
         extras["log"] = self._account(terms, reasons, causes, dones, time_outs)
         reset_ids = dones.nonzero().squeeze(1)
         if len(reset_ids):
             self._reset(reset_ids)
         self._resample()
-        return self._groups(None), rewards.float(), dones, extras
+        return self.get_observations(), rewards.float(), dones, extras
 
     def reset(self) -> None:
         """Start new episodes everywhere; random streams go on."""
@@ -191,7 +189,17 @@ class HumanoidEnv(VecEnv):
 
     def get_observations(self) -> TensorDict:
         """Observation groups at the present state, fresh tensors."""
-        return self._groups(None)
+        cfg, state, friction = self.task.observations, self.state, self.task.randomization.friction
+        groups = {
+            "history": self.history.flat,
+            "command": command_observation(state, cfg),
+            "clock": clock(state.foot_phase),
+            "critic": critic_observation(self._last_frame, state, self.robots, self.embodiment, cfg, friction),
+            "estimate": estimation_target(state, self.embodiment, cfg),
+            "slot_mask": self.robots.slot_mask,
+        }
+        tensors = {name: value.float() for name, value in groups.items()}
+        return TensorDict(tensors | {"robot": self.robots.robot_id}, batch_size=[self.num_envs])
 
     @property
     def command(self) -> Tensor:
@@ -237,38 +245,36 @@ class HumanoidEnv(VecEnv):
         absurd = (live & ~sound).any(dim=1, keepdim=True)
         return (targets + self.randomizer.motor_offset).masked_fill(absurd, torch.nan)
 
-    def _harness(self) -> Tensor | None:
-        """Wrench of the virtual harness, or None once it is off for every robot."""
-        if not self.aids.harness.any():
-            return None
-        return harness_wrench(self.state, self.robots, self.aids.harness[self.robots.robot_id].to(self.command.dtype))
+    def _physics_step(self, targets: Tensor) -> None:
+        """Push, help and step every robot."""
+        self.randomizer.push(self.common_step_counter, self.penalty_scale, self.step_dt)
+        wrench = None if self._harness is None else harness_wrench(self.state, self.robots, self._harness)
+        self._staged = self.pool.step(targets, wrench)
 
-    def _set_harness_damping(self) -> None:
-        """Put the harness' share of the damping in force; it changes only when the aids do."""
+    def _apply_aids(self) -> None:
+        """Spread the aids' scales over the environments, and put the harness' share of the damping in force."""
+        robot, dtype = self.robots.robot_id, self.command.dtype
+        self._gait_shaping = self.aids.gait_shaping[robot].to(dtype)
+        harness = self.aids.harness[robot].to(dtype)
+        self._harness = harness if harness.any() else None
         if self.task.aids.harness > 0:
-            scale = self.aids.harness[self.robots.robot_id].to(self.command.dtype)
-            self.pool.set_base_damping(harness_damping(self.robots, scale))
+            self.pool.set_base_damping(harness_damping(self.robots, harness))
 
-    def _derive(self, staged: Tensor, ids: Tensor | None = None) -> PooledState:
-        """Turn staging rows into the pooled state, with the command, phase and actions now in force."""
-        physical = measured(staged, self.pool.columns)
-        standing = self.commands.standing
-
-        def of(buffer: Tensor) -> Tensor:
-            return buffer if ids is None else buffer[ids]
-
+    def _derive(self) -> PooledState:
+        """Turn the staging rows into the pooled state, with the command, phase and actions now in force."""
+        physical = measured(self._staged, self.pool.columns)
         return PooledState(
             **physical,
             **self.ground.measure(physical["root_pos_w"], physical["root_quat_w"], physical["foot_pos_w"]),
-            joint_acc=(physical["joint_vel"] - of(self._last_joint_vel)) / self.step_dt,
-            last_foot_contact=of(self._last_contact),
-            friction=of(self.randomizer.friction),
-            command=of(self.command),
-            standing=of(standing),
-            foot_phase=foot_phases(of(self.phase), of(standing), self.task.gait),
-            actions=of(self._actions),
-            last_actions=of(self._last_actions),
-            last_last_actions=of(self._last_last_actions),
+            joint_acc=(physical["joint_vel"] - self._last_joint_vel) / self.step_dt,
+            last_foot_contact=self._last_contact,
+            friction=self.randomizer.friction,
+            command=self.command,
+            standing=self.commands.standing,
+            foot_phase=foot_phases(self.phase, self.commands.standing, self.task.gait),
+            actions=self._actions,
+            last_actions=self._last_actions,
+            last_last_actions=self._last_last_actions,
         )
 
     def _rewards(self, terminated: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
@@ -276,12 +282,10 @@ class HumanoidEnv(VecEnv):
         context = RewardContext(
             cfg=self.task.rewards,
             gait=self.task.gait,
-            gait_shaping=self.aids.gait_shaping[self.robots.robot_id].to(self.command.dtype),
+            gait_shaping=self._gait_shaping,
             terminated=terminated,
         )
         rewards, terms = compute_rewards(self.state, self.robots, context, self.penalty_scale, self.step_dt)
-        self._last_joint_vel = self.state.joint_vel
-        self._last_contact = self.state.foot_contact
         scores = success_scores(self.state, self.robots, context)
         self.commands.judge(scores)
         self.ground.judge(scores[0], self.state)
@@ -293,29 +297,10 @@ class HumanoidEnv(VecEnv):
         frame = proprioception(self.state, self.robots, cfg)
         sensed = delay(frame, self._last_frame, self.randomizer.latency)
         if cfg.enable_corruption:
-            noise = self.rng.uniform("observation_noise", self.step_count, frame.shape[1])
+            noise = self.rng.uniform("observation_noise", self.common_step_counter, frame.shape[1])
             sensed = sensed + (2.0 * noise - 1.0).to(frame.dtype) * self._noise
         self._last_frame = frame
         self.history.push(sensed)
-
-    def _groups(self, ids: Tensor | None) -> TensorDict:
-        """Observation groups of some environments (None: all) at the present state."""
-        cfg = self.task.observations
-        state = self.state if ids is None else self.state.rows(ids)
-        robots = self.robots if ids is None else self.robots.rows(ids)
-        embodiment = self.embodiment if ids is None or self.embodiment is None else self.embodiment[ids]
-        frames = self.history.frames if ids is None else self.history.frames[ids]
-        frame = self._last_frame if ids is None else self._last_frame[ids]
-        groups = {
-            "history": frames.flatten(1),
-            "command": command_observation(state, cfg),
-            "clock": clock(state.foot_phase),
-            "critic": critic_observation(frame, state, robots, embodiment, cfg, self.task.randomization.friction),
-            "estimate": estimation_target(state, embodiment, cfg),
-            "slot_mask": robots.slot_mask,
-        }
-        tensors = {name: value.float() for name, value in groups.items()}
-        return TensorDict(tensors | {"robot": robots.robot_id}, batch_size=[len(state.command)])
 
     def _reset(self, ids: Tensor) -> None:
         """Start new episodes; other environments are untouched, bit for bit."""
@@ -331,16 +316,10 @@ class HumanoidEnv(VecEnv):
         for name in ("_actions", "_last_actions", "_last_last_actions", "_last_contact"):
             setattr(self, name, getattr(self, name).index_fill(0, ids, 0))
         self._last_joint_vel = self._last_joint_vel.index_copy(0, ids, staged[:, self.pool.columns["joint_vel"]])
-        self._write_rows(ids, self._derive(staged, ids))
-        frame = proprioception(self.state.rows(ids), self.robots.rows(ids), self.task.observations)
-        self._last_frame = self._last_frame.index_copy(0, ids, frame)
-        self.history.reset(ids, frame)
-
-    def _write_rows(self, ids: Tensor, rows: PooledState) -> None:
-        """Replace some rows of the state by new tensors, so that earlier observations keep theirs."""
-        self.state = PooledState(
-            **{f.name: getattr(self.state, f.name).index_copy(0, ids, getattr(rows, f.name)) for f in fields(rows)}
-        )
+        self._staged = self._staged.index_copy(0, ids, staged)
+        self.state = self._derive()
+        self._last_frame = proprioception(self.state, self.robots, self.task.observations)
+        self.history.reset(ids, self._last_frame[ids])
 
     def _resample(self) -> None:
         """Draw new commands where their time is up."""
@@ -360,7 +339,7 @@ class HumanoidEnv(VecEnv):
             return {}
         entry, falls_per_step, match_per_robot = self.step_log.flush()
         self.aids.update(episode_ratio(falls_per_step, self.max_episode_length), match_per_robot)
-        self._set_harness_damping()
+        self._apply_aids()
         entry["Curriculum/penalty_scale"] = torch.tensor(self.penalty_scale)
         names = self.robot_names
         return entry | self.commands.log() | self.aids.log(names) | self.ground.log(names)
@@ -368,7 +347,7 @@ class HumanoidEnv(VecEnv):
     # --- exact resume -------------------------------------------------------------------------------------------------
 
     _BUFFERS = (
-        "episode_length_buf episode_count step_count phase _actions _last_actions _last_last_actions _last_joint_vel "
+        "episode_length_buf episode_count phase _actions _last_actions _last_last_actions _last_joint_vel "
         "_last_contact _last_frame"
     ).split()
 
@@ -380,7 +359,6 @@ class HumanoidEnv(VecEnv):
         return {
             "common_step_counter": self.common_step_counter,
             "buffers": {name: getattr(self, name).clone() for name in self._BUFFERS},
-            "state": {f.name: getattr(self.state, f.name).clone() for f in fields(self.state)},
             "history": self.history.frames.clone(),
         } | {name: getattr(self, name).state_dict() for name in self._PARTS}
 
@@ -389,8 +367,9 @@ class HumanoidEnv(VecEnv):
         self.common_step_counter = state["common_step_counter"]
         for name, value in state["buffers"].items():
             setattr(self, name, value.to(self.device, copy=True))
-        self.state = PooledState(**{name: value.to(self.device) for name, value in state["state"].items()})
         self.history.frames = state["history"].to(self.device, copy=True)
         for name in self._PARTS:
             getattr(self, name).load_state_dict(state[name])
-        self._set_harness_damping()
+        self._apply_aids()
+        self._staged = self.pool.staged()
+        self.state = self._derive()

@@ -16,9 +16,9 @@ _MIX_1 = -4658895280553007687  # 0xBF58476D1CE4E5B9
 _MIX_2 = -7723592293110705685  # 0x94D049BB133111EB
 
 
-def _stream_key(stream: str) -> int:
-    """A signed 64-bit integer for a stream's name."""
-    return (zlib.crc32(stream.encode()) * _GOLDEN + 2**63) % 2**64 - 2**63
+def _times_golden(x: int) -> int:
+    """``x * _GOLDEN`` as a signed 64-bit integer, as a tensor would have it."""
+    return (x * _GOLDEN + 2**63) % 2**64 - 2**63
 
 
 def _shift_right(x: Tensor, bits: int) -> Tensor:
@@ -50,12 +50,13 @@ class CounterRng:
         self._stream_keys: dict[str, Tensor] = {}
         self._columns: dict[int, Tensor] = {}
 
-    def uniform(self, stream: str, count: Tensor, size: int, ids: Tensor | None = None) -> Tensor:
+    def uniform(self, stream: str, count: Tensor | int, size: int, ids: Tensor | None = None) -> Tensor:
         """Numbers uniform in [0, 1).
 
         Args:
             stream: name of what is drawn; different names are independent.
-            count: how often this was drawn before, int64, shape (n,): the coordinate that makes draws differ.
+            count: how often this was drawn before, the coordinate that makes draws differ: int64, shape (n,), or one
+                number for all.
             size: numbers per environment.
             ids: environments, shape (n,), or None for all.
 
@@ -63,7 +64,8 @@ class CounterRng:
             Float32 tensor, shape (n, size); 24 random bits each.
         """
         key = self._stream_key(stream)
-        key = (key if ids is None else key[ids]) + count * _GOLDEN
+        key = key if ids is None else key[ids]
+        key = key + (_times_golden(count) if isinstance(count, int) else count * _GOLDEN)
         words = _mix(key.unsqueeze(1) + self._column_keys(size)).view(torch.int32)  # two numbers a hash
         return (words[:, :size] >> 8).to(torch.float32).mul_(2.0**-24).add_(0.5)
 
@@ -72,7 +74,7 @@ class CounterRng:
         low: float | Tensor,
         high: float | Tensor,
         stream: str,
-        count: Tensor,
+        count: Tensor | int,
         size: int,
         ids: Tensor | None = None,
     ) -> Tensor:
@@ -82,7 +84,7 @@ class CounterRng:
     def _stream_key(self, stream: str) -> Tensor:
         """One key per environment for a stream, derived at its first use, shape (N,)."""
         if stream not in self._stream_keys:
-            self._stream_keys[stream] = _mix(self.key + _stream_key(stream))
+            self._stream_keys[stream] = _mix(self.key + _times_golden(zlib.crc32(stream.encode())))
         return self._stream_keys[stream]
 
     def _column_keys(self, size: int) -> Tensor:

@@ -30,9 +30,8 @@ class Policy:
 
 def load_policy(path: Path, device: str = "cpu") -> Policy:
     """The policy a path means; on another device than it was trained on, if asked."""
-    import torch
-
     from eagle_rl.config.load import experiment_from_plain
+    from eagle_rl.models.precision import set_up_torch
     from eagle_rl.runners.checkpoint import load_actor
     from eagle_rl.runners.judged import training_steps
     from eagle_rl.runners.locate import find_checkpoint
@@ -42,7 +41,7 @@ def load_policy(path: Path, device: str = "cpu") -> Policy:
     checkpoint = find_checkpoint(path)
     actor, manifest = load_actor(checkpoint, device, slot_table_hash(SLOT_NAMES))
     cfg = experiment_from_plain(manifest["config"], str(checkpoint))
-    torch.set_num_threads(cfg.run.torch_threads)
+    set_up_torch(cfg.run.torch_threads)
     cfg = dataclasses.replace(cfg, run=dataclasses.replace(cfg.run, device=device))
     return Policy(actor, cfg, manifest["sha256"], training_steps(checkpoint))
 

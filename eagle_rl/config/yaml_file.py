@@ -129,9 +129,7 @@ def read_yaml(path: Path) -> Node:
     """
     node = parse_yaml(read_text(path), shown(path))
     if not isinstance(node.value, dict):
-        raise ConfigError(
-            f"{shown(path)}: expected keys and values at the top level, got {type(node.value).__name__}."
-        )
+        raise ConfigError(f"{shown(path)}: expected keys and values at the top level, got {type(node.value).__name__}.")
     return node
 
 

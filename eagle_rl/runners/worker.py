@@ -7,12 +7,12 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import torch
 from rich.console import Console
 
 from eagle_rl.config.schema import ExperimentCfg
 from eagle_rl.evaluation.evaluate import EvaluationResult, evaluate
 from eagle_rl.evaluation.report import pooled_score
+from eagle_rl.models.precision import set_up_torch
 from eagle_rl.runners.checkpoint import load_checkpoint, read_manifest
 from eagle_rl.runners.claims import Claim, ClaimLostError
 from eagle_rl.runners.files import write_atomically
@@ -46,7 +46,7 @@ class Worker:
 
     def work(self, console: Console | None = None) -> None:
         """Claim and run stages as they become ready."""
-        torch.set_num_threads(self.cfg.run.torch_threads)
+        set_up_torch(self.cfg.run.torch_threads)
         while True:
             claimed = self._claim() if self.team.leads else None
             name = self.team.agree(lambda: claimed and claimed[0].name)  # noqa: B023 (called at once)

@@ -96,18 +96,14 @@ class Randomizer:
         numbers = self._rng.uniform(stream, count, sum(widths), ids).to(self.friction.dtype)
         return [low + (high - low) * u for ((low, high), _), u in zip(rows, numbers.split(widths, dim=1), strict=True)]
 
-    def push(self, steps: Tensor, penalty_scale: float, step_dt: float) -> None:
-        """Push the environments whose time has come; ``steps`` counts each one's control steps since creation."""
+    def push(self, step: int, penalty_scale: float, step_dt: float) -> None:
+        """Push every environment when its time has come; ``step`` counts the control steps since creation."""
         interval = round(self.cfg.push_interval_s / step_dt)
-        if not self.cfg.enabled or interval == 0:
+        if not self.cfg.enabled or interval == 0 or step % interval != interval - 1:
             return
-        ids = ((steps % interval) == interval - 1).nonzero().squeeze(1)
-        if len(ids) == 0:
-            return
-        u = 2.0 * self._rng.uniform("push", steps[ids], 6, ids) - 1.0
-        self._pool.push(
-            ids, u[:, :3] * self.cfg.push_lin_vel * penalty_scale, u[:, 3:] * self.cfg.push_ang_vel * penalty_scale
-        )
+        u = penalty_scale * self._rng.uniform_in(-1.0, 1.0, "push", step, 6)
+        everyone = torch.arange(len(u), device=u.device)
+        self._pool.push(everyone, u[:, :3] * self.cfg.push_lin_vel, u[:, 3:] * self.cfg.push_ang_vel)
 
     def state_dict(self) -> dict[str, Any]:
         """The draws in force; those made at creation follow from the seed."""

@@ -42,7 +42,9 @@ def test_bad_numbers_are_caught_in_the_same_step_and_nobody_else_changes(where: 
     batch = spoiled.pool.batches[1]
     if where == "xfrc_applied":
         batch._batch.bind(where)[0, 1, 2] = value
-        spoiled.aids.harness[:] = healthy.aids.harness[:] = 0.0  # which would overwrite it
+        for env in (healthy, spoiled):
+            env.aids.harness[:] = 0.0  # which would overwrite it
+            env._apply_aids()
     elif where == "qacc_warmstart":
         if value == 1e12:
             return  # a poor first guess is no fault
