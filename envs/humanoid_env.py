@@ -14,6 +14,8 @@ from torch import Tensor
 
 from eagle_rl.config.schema import TaskCfg
 
+from .ground import make_ground
+from .mdp.active_commands import ActiveCommands
 from .mdp.aids import LearningAids, harness_damping, harness_wrench
 from .mdp.commands import CommandSampler
 from .mdp.curriculum import penalty_scale
@@ -28,6 +30,7 @@ from .mdp.observations import (
     estimation_target,
     noise_scale,
     proprioception,
+    scan_points,
 )
 from .mdp.randomization import Randomizer
 from .mdp.rewards import RewardContext, compute_rewards, success_scores
@@ -42,11 +45,9 @@ from .robots.spec import RobotSpec
 from .sim.batch import RobotBatch
 from .sim.health import MAX_ACTION
 from .sim.pool import PhysicsPool
+from .sim.terrain import build_terrain
 from .state import PooledState
 from .step_log import StepLog, episode_ratio
-
-LOG_INTERVAL = 24
-"""Control steps between entries in ``extras["log"]``."""
 
 
 class HumanoidEnv(VecEnv):
@@ -88,32 +89,38 @@ class HumanoidEnv(VecEnv):
         self.max_episode_length = round(task.terminations.episode_length_s / self.step_dt)
         self.robot_names = [spec.name for spec in robots]
         counts = share(num_envs, len(robots))
+        terrain = build_terrain(task.terrain, seed)
+        field = terrain.field if terrain is not None else None
         batches = [
-            RobotBatch(spec, build_model(spec, task.sim), count, task.sim.decimation, num_threads)
+            RobotBatch(spec, build_model(spec, task.sim, field), count, task.sim.decimation, num_threads)
             for spec, count in zip(robots, counts, strict=True)
         ]
         self.pool = PhysicsPool(batches, self.device, dtype)
-        self.robots = pool_robots(robots, counts, task.control, task.rewards, self.device, dtype)
+        nominal = pool_robots(robots, counts, task.control, task.rewards, self.device, dtype)
         self.rng = CounterRng(
             seed,
             [name for name, count in zip(self.robot_names, counts, strict=True) for _ in range(count)],
             torch.cat([torch.arange(count) for count in counts]).to(self.device),
         )
-        self.randomizer = Randomizer(task.randomization, self.pool, self.robots, self.rng)
-        self.commands = CommandSampler(task.commands, self.robots, len(robots), self.rng, self.step_dt)
+        self.randomizer = Randomizer(task.randomization, self.pool, nominal, self.rng)
+        self.robots = self.randomizer.robots
+        sampler = CommandSampler(task.commands, self.robots, len(robots), self.rng, self.step_dt)
+        self.commands = ActiveCommands(sampler, round(task.commands.resampling_time_s / self.step_dt), dtype)
         self.aids = LearningAids(task.aids, len(robots), self.device)
         observations = task.observations
+        points = scan_points(observations).to(self.device, dtype)
+        robot_id = self.robots.robot_id
+        self.ground = make_ground(terrain, points, robot_id, self.rng, self.step_dt, self.max_episode_length)
         self.embodiment = (
-            pooled_embodiment(robots, self.robots.robot_id, self.randomizer.bodies, observations.descriptor)
+            pooled_embodiment(robots, robot_id, self.randomizer.bodies, observations.descriptor)
             if observations.embodiment_observation
             else None
         )
         self.layout = ObservationLayout(observations)
         self.mirror = self.layout.mirror(self.device)
         self._noise = noise_scale(observations, self.robots)
-        self.step_log = StepLog(self.robot_names, self.robots.robot_id)
+        self.step_log = StepLog(self.robot_names, robot_id)
         self._all = torch.arange(num_envs, device=self.device)
-        self._pinned: Tensor | None = None
         self._allocate(dtype)
         self._apply_aids()
         self._reset(self._all)
@@ -125,15 +132,11 @@ class HumanoidEnv(VecEnv):
         self.common_step_counter = 0
         self.episode_length_buf = torch.zeros(n, dtype=torch.long, device=device)
         self.episode_count = torch.zeros(n, dtype=torch.long, device=device)
-        self.command_count = torch.zeros(n, dtype=torch.long, device=device)
         self.phase = torch.zeros(n, dtype=dtype, device=device)
-        self.command = torch.zeros(n, 5, dtype=dtype, device=device)
-        self.standing = torch.zeros(n, dtype=torch.bool, device=device)
         zeros = torch.zeros(n, NUM_SLOTS, dtype=dtype, device=device)
         self._actions, self._last_actions, self._last_last_actions = zeros, zeros, zeros
         self._last_joint_vel = zeros
         self._last_contact = torch.zeros(n, 2, dtype=torch.bool, device=device)
-        self._height_scan = torch.zeros(n, self.layout.num_scan_points, dtype=dtype, device=device)
         self._staged = self.pool.staged()
         self.state = self._derive()
         self._last_frame = proprioception(self.state, self.robots, self.task.observations)
@@ -163,7 +166,8 @@ class HumanoidEnv(VecEnv):
         self.state = self._derive()
         reasons = terminations(self.state, self.task.terminations)
         fallen = torch.stack(list(reasons.values())).any(dim=0) & ~sick
-        time_outs = (self.episode_length_buf >= self.max_episode_length) & ~(fallen | sick)
+        over = (self.episode_length_buf >= self.max_episode_length) | self.ground.left(self.state.root_pos_w)
+        time_outs = over & ~(fallen | sick)
         dones = fallen | sick | time_outs
         rewards, terms = self._rewards(fallen)
         rewards = rewards.masked_fill(sick, 0.0)
@@ -197,6 +201,11 @@ class HumanoidEnv(VecEnv):
         tensors = {name: value.float() for name, value in groups.items()}
         return TensorDict(tensors | {"robot": self.robots.robot_id}, batch_size=[self.num_envs])
 
+    @property
+    def command(self) -> Tensor:
+        """Commands in force (v_x, v_y, omega, h, p), shape (N, 5)."""
+        return self.commands.command
+
     def tracking_errors(self) -> Tensor:
         """Absolute error of each command at the last step [m/s, m/s, rad/s, m, rad], shape (N, 5)."""
         return tracking_errors(self.state, self.robots)
@@ -207,10 +216,8 @@ class HumanoidEnv(VecEnv):
 
     def pin_commands(self, command: Tensor | None) -> None:
         """Hold these commands, shape (N, 5), instead of sampling; ``None`` returns to sampling at the next draw."""
-        self._pinned = None if command is None else command.to(self.command)
-        if self._pinned is not None:
-            self._set_commands(self._all, self._pinned)
-            self._show_commands()
+        self.commands.pin(command)
+        self.commands.show(self.state, self.phase, self.task.gait)
 
     @property
     def penalty_scale(self) -> float:
@@ -258,15 +265,13 @@ class HumanoidEnv(VecEnv):
         physical = measured(self._staged, self.pool.columns)
         return PooledState(
             **physical,
-            base_height=physical["root_pos_w"][:, 2],
+            **self.ground.measure(physical["root_pos_w"], physical["root_quat_w"], physical["foot_pos_w"]),
             joint_acc=(physical["joint_vel"] - self._last_joint_vel) / self.step_dt,
-            foot_height=physical["foot_pos_w"][..., 2],
             last_foot_contact=self._last_contact,
-            height_scan=self._height_scan,
             friction=self.randomizer.friction,
             command=self.command,
-            standing=self.standing,
-            foot_phase=foot_phases(self.phase, self.standing, self.task.gait),
+            standing=self.commands.standing,
+            foot_phase=foot_phases(self.phase, self.commands.standing, self.task.gait),
             actions=self._actions,
             last_actions=self._last_actions,
             last_last_actions=self._last_last_actions,
@@ -281,8 +286,9 @@ class HumanoidEnv(VecEnv):
             terminated=terminated,
         )
         rewards, terms = compute_rewards(self.state, self.robots, context, self.penalty_scale, self.step_dt)
-        if self._pinned is None:
-            self.commands.accumulate(*success_scores(self.state, self.robots, context))
+        scores = success_scores(self.state, self.robots, context)
+        self.commands.judge(scores)
+        self.ground.judge(scores[0], self.state)
         return rewards, terms
 
     def _observe(self) -> None:
@@ -298,13 +304,15 @@ class HumanoidEnv(VecEnv):
 
     def _reset(self, ids: Tensor) -> None:
         """Start new episodes; other environments are untouched, bit for bit."""
-        self.randomizer.reset(ids, self.episode_count[ids], self.step_dt)
-        root, joint_pos, joint_vel = self.randomizer.initial_state(ids, self.episode_count[ids])
-        staged = self.pool.reset(ids, root, joint_pos, joint_vel)
+        count = self.episode_count[ids]
+        self.ground.advance(ids, count, self.state.rows(ids), self.episode_length_buf[ids])
+        self.randomizer.reset(ids, count, self.step_dt)
+        root, joint_pos, joint_vel = self.randomizer.initial_state(ids, count)
+        staged = self.pool.reset(ids, self.ground.place(ids, count, root), joint_pos, joint_vel)
         self.episode_count[ids] += 1
         self.episode_length_buf = self.episode_length_buf.index_fill(0, ids, 0)
         self.phase = self.phase.index_fill(0, ids, 0.0)
-        self._draw_commands(ids)
+        self.commands.draw(ids)
         for name in ("_actions", "_last_actions", "_last_last_actions", "_last_contact"):
             setattr(self, name, getattr(self, name).index_fill(0, ids, 0))
         self._last_joint_vel = self._last_joint_vel.index_copy(0, ids, staged[:, self.pool.columns["joint_vel"]])
@@ -315,53 +323,35 @@ class HumanoidEnv(VecEnv):
 
     def _resample(self) -> None:
         """Draw new commands where their time is up."""
-        interval = round(self.task.commands.resampling_time_s / self.step_dt)
-        ids = ((self.episode_length_buf % interval == 0) & (self.episode_length_buf > 0)).nonzero().squeeze(1)
+        ids = self.commands.due(self.episode_length_buf)
         if len(ids):
-            self._draw_commands(ids)
-            self._show_commands()
-
-    def _show_commands(self) -> None:
-        """Let the present state, and so the next observation, show the commands now in force."""
-        self.state.command, self.state.standing = self.command, self.standing
-        self.state.foot_phase = foot_phases(self.phase, self.standing, self.task.gait)
-
-    def _draw_commands(self, ids: Tensor) -> None:
-        if self._pinned is not None:
-            self._set_commands(ids, self._pinned[ids])
-            return
-        command, _ = self.commands.sample(ids, self.command_count[ids])
-        self.command_count[ids] += 1
-        self._set_commands(ids, command)
-
-    def _set_commands(self, ids: Tensor, command: Tensor) -> None:
-        """Put commands in force; standing means all three velocities are zero (HugWBC 1)."""
-        self.command = self.command.index_copy(0, ids, command.to(self.command.dtype))
-        self.standing = (self.command[:, :3] == 0).all(dim=1)
+            self.commands.draw(ids)
+            self.commands.show(self.state, self.phase, self.task.gait)
 
     def _account(
         self, terms: dict[str, Tensor], reasons: dict[str, Tensor], causes: Tensor, dones: Tensor, time_outs: Tensor
     ) -> dict[str, Tensor | float]:
-        """Add the step to the log and the aids; returns tags and values once per ``LOG_INTERVAL``."""
+        """Add the step to the log and the aids; returns tags and values now and then."""
         match = contact_match(self.state, self.task.gait)
         falls = dones & ~time_outs
         self.step_log.add(terms, reasons, causes, self.tracking_errors(), match, falls, dones, self.state.standing)
-        if self.common_step_counter % LOG_INTERVAL:
+        if self.common_step_counter % self.task.aids.interval_steps:
             return {}
         entry, falls_per_step, match_per_robot = self.step_log.flush()
         self.aids.update(episode_ratio(falls_per_step, self.max_episode_length), match_per_robot)
         self._apply_aids()
-        k = torch.tensor(self.penalty_scale)
-        return entry | self.commands.log() | self.aids.log(self.robot_names) | {"Curriculum/penalty_scale": k}
+        entry["Curriculum/penalty_scale"] = torch.tensor(self.penalty_scale)
+        names = self.robot_names
+        return entry | self.commands.log() | self.aids.log(names) | self.ground.log(names)
 
     # --- exact resume -------------------------------------------------------------------------------------------------
 
     _BUFFERS = (
-        "episode_length_buf episode_count command_count phase command standing _actions _last_actions "
-        "_last_last_actions _last_joint_vel _last_contact _last_frame"
+        "episode_length_buf episode_count phase _actions _last_actions _last_last_actions _last_joint_vel "
+        "_last_contact _last_frame"
     ).split()
 
-    _PARTS = ("randomizer", "pool", "commands", "aids", "step_log")
+    _PARTS = ("randomizer", "pool", "commands", "ground", "aids", "step_log")
     """What has a state of its own; randomization first, because the physics is recomputed under it."""
 
     def state_dict(self) -> dict[str, Any]:

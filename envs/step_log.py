@@ -94,7 +94,7 @@ class StepLog:
         match = sums[:, column["match"]] / sums[:, column["moving"]].clamp(min=1.0)
         dones = sums[:, column["dones"]]
         falls_per_step = means[:, column["falls"]]
-        sick_share = sum(means[:, i] for tag, i in column.items() if tag.startswith("Health/"))
+        sick_share = means[:, [i for tag, i in column.items() if tag.startswith("Health/")]].sum(dim=1)
         entry: dict[str, Tensor] = {}
         for robot, name in enumerate(self._names):
             for tag, i in column.items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable
 from typing import Any
@@ -69,6 +70,7 @@ class BrowserScene:
         self._labels = [
             server.scene.add_label(f"/world/names/{name}", name, anchor="bottom-center") for name in stage.names
         ]
+        self.update()
 
     def update(self) -> None:
         """Send the stage's pose."""
@@ -124,15 +126,15 @@ def serve(session: Session, script: CommandScript | None, seconds: float | None)
     scene = BrowserScene(server, stage)
     command_at = _command_source(server, session, script)
     start = time.monotonic()
-    try:
+    with contextlib.ExitStack() as stack:
+        stack.callback(server.stop)
+        stack.enter_context(contextlib.suppress(KeyboardInterrupt))
         while seconds is None or session.time < seconds:
             session.step(command_at())
             if session.num_steps % FRAME_STEPS == 0:
                 stage.pose(session.qpos)
                 scene.update()
             time.sleep(max(0.0, start + session.time - time.monotonic()))
-    finally:
-        server.stop()
 
 
 def _command_source(server: viser.ViserServer, session: Session, script: CommandScript | None) -> Callable[[], Array]:

@@ -65,6 +65,8 @@ def _split(word: str) -> tuple[str | None, Path]:
 
 def _method(cfg: ExperimentCfg) -> str:
     """The paper's name for an experiment, or its own."""
+    if cfg.plan.method == "ppo" and cfg.plan.root is not None:
+        return "PPO continued"
     return METHODS.get("single" if len(cfg.robots) == 1 and cfg.plan.method == "ppo" else cfg.name, cfg.name)
 
 
@@ -95,7 +97,9 @@ def _judge(name: str, policy: Policy, ev: EvaluationCfg, robots: Sequence[str], 
     with Progress(console=console, transient=True) as progress:
         bar = progress.add_task(name, total=len(robots) * ev.num_envs_per_robot * ev.num_steps)
         scores = evaluate(policy.actor, make_env, robots, cfg.task, ev, on_step=lambda n: progress.advance(bar, n))
-    return EvaluationResult(checkpoint=policy.sha256, protocol=ev, robots=scores, seed=cfg.seed)
+    return EvaluationResult(
+        checkpoint=policy.sha256, protocol=ev, robots=scores, seed=cfg.seed, env_steps=policy.env_steps
+    )
 
 
 def main(argv: Sequence[str]) -> int:

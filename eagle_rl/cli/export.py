@@ -60,7 +60,7 @@ def build_contract(cfg: ExperimentCfg, checkpoint: str, robots: Sequence[str]) -
         gait_frequency=task.gait.frequency,
         gait_phase_offset=task.gait.phase_offset,
         standing_phase=STANDING_PHASE,
-        robots={name: _robot(load_robot(name), cfg) for name in robots},
+        robots={spec.name: _robot(spec, cfg) for spec in map(load_robot, robots)},
     )
 
 

@@ -19,6 +19,7 @@ from eagle_rl.config.schema import (
     RewardsCfg,
     TaskCfg,
     TerminationsCfg,
+    TerrainCfg,
 )
 from eagle_rl.config.validate import CONTROL_STEP
 
@@ -91,7 +92,7 @@ def _rewards(cfg: RewardsCfg) -> Table:
     return make_table(title, ("term", "weight", "per step", "value"), rows)
 
 
-def _documented(title: str, cfg: RandomizationCfg | AidsCfg | TerminationsCfg) -> Table:
+def _documented(title: str, cfg: RandomizationCfg | AidsCfg | TerminationsCfg | TerrainCfg) -> Table:
     docs = field_docs(cfg)
     rows = [(f.name, _text(getattr(cfg, f.name)), docs.get(f.name, "")) for f in dataclasses.fields(cfg)]
     return make_table(title, ("key", "value", "meaning"), rows)
@@ -109,6 +110,7 @@ def print_mdp(task: TaskCfg, console: Console) -> None:
         _observations(task.observations),
         _rewards(task.rewards),
         _documented("Terminations", task.terminations),
+        _documented("Terrain", task.terrain),
         randomization_table(task.randomization),
         _documented("Learning aids", task.aids),
     ):

@@ -47,6 +47,9 @@ def _parser() -> argparse.ArgumentParser:
         help=f"command script, a YAML file or one of {', '.join(known_names('commands'))}",
     )
     parser.add_argument("--seconds", type=float, metavar="S", help="stop after so long [the script's end]")
+    parser.add_argument(
+        "--replay-fault", type=Path, metavar="FILE.npz", help="show the last states of a sick environment instead"
+    )
     return parser
 
 
@@ -103,12 +106,18 @@ def main(argv: Sequence[str]) -> int:
         raise ConfigError("--viewer native needs a display, and there is none here. Make a video: --video robots.mp4")
     script = load_commands(args.commands or "demo")
 
-    from eagle_rl.runners.locate import find_checkpoint
     from envs.rendering.recorder import check_writable
 
     for path, suffix in ((args.video, ".mp4"), (args.contact_sheet, ".png")):
         if path is not None:
             check_writable(path, suffix)
+    if args.replay_fault is not None:
+        from .replay import replay
+
+        replay(args.replay_fault, args.video, args.contact_sheet, SIZE)
+        return 0
+
+    from eagle_rl.runners.locate import find_checkpoint
 
     checkpoint = find_checkpoint(args.checkpoint or newest_run())
     if viewer == "none":

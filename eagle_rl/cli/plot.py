@@ -79,7 +79,7 @@ def _rounds(args: argparse.Namespace) -> dict[str, Figure]:
 
     figures = {}
     for name, run in map(_named, args.paths):
-        judged = [(stage.round, stage.kind == "specialist", file) for stage, file in judged_stages(run, read_plan(run))]
+        judged = [(stage.round, stage.specialised, file) for stage, file in judged_stages(run, read_plan(run))]
         figures[name] = plots.error_rounds(read_rounds(judged))
     return figures
 

@@ -24,6 +24,8 @@ class Policy:
     """The experiment it was trained in, to be run on the device asked for."""
     sha256: str
     """Of its checkpoint."""
+    env_steps: int | None
+    """What it has cost, if known."""
 
 
 def load_policy(path: Path, device: str = "cpu") -> Policy:
@@ -31,6 +33,7 @@ def load_policy(path: Path, device: str = "cpu") -> Policy:
     from eagle_rl.config.load import experiment_from_plain
     from eagle_rl.models.precision import set_up_torch
     from eagle_rl.runners.checkpoint import load_actor
+    from eagle_rl.runners.judged import training_steps
     from eagle_rl.runners.locate import find_checkpoint
     from eagle_rl.runners.provenance import slot_table_hash
     from envs.robots.slots import SLOT_NAMES
@@ -39,7 +42,8 @@ def load_policy(path: Path, device: str = "cpu") -> Policy:
     actor, manifest = load_actor(checkpoint, device, slot_table_hash(SLOT_NAMES))
     cfg = experiment_from_plain(manifest["config"], str(checkpoint))
     set_up_torch(cfg.run.torch_threads)
-    return Policy(actor, dataclasses.replace(cfg, run=dataclasses.replace(cfg.run, device=device)), manifest["sha256"])
+    cfg = dataclasses.replace(cfg, run=dataclasses.replace(cfg.run, device=device))
+    return Policy(actor, cfg, manifest["sha256"], training_steps(checkpoint))
 
 
 def chosen_robots(text: str | None, cfg: ExperimentCfg) -> tuple[str, ...]:

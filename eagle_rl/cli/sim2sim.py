@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
     from eagle_rl.config.commands import CommandScript
     from eagle_rl.export.runtime import OnnxPolicy, Reading
+    from envs.robots.spec import RobotSpec
 
 MAX_TILT = 1.0
 """Inclination of the base beyond which the robot counts as fallen [rad]."""
@@ -38,7 +39,7 @@ class Outcome:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="eagle sim2sim", description=__doc__)
     parser.add_argument("policy", type=Path, metavar="FILE.onnx", help="what eagle export wrote")
-    parser.add_argument("--robot", required=True, metavar="NAME", help="one of the robots in the file")
+    parser.add_argument("--robot", required=True, metavar="NAME|FILE", help="one of the robots in the file")
     parser.add_argument(
         "--commands",
         default="demo",
@@ -55,26 +56,28 @@ def main(argv: Sequence[str]) -> int:
     script = load_commands(args.commands)
 
     from eagle_rl.export.runtime import OnnxPolicy
+    from envs.robots.load import load_robot
 
-    policy = OnnxPolicy(args.policy, args.robot)
+    spec = load_robot(args.robot)
+    policy = OnnxPolicy(args.policy, spec.name)
     substeps = round(policy.contract.step_dt / args.physics_dt) if args.physics_dt > 0 else 0
     if substeps < 1 or abs(substeps * args.physics_dt - policy.contract.step_dt) > 1e-9:
         step = policy.contract.step_dt
         raise ConfigError(f"--physics-dt: got {args.physics_dt:g}, expected a whole fraction of {step:g} s.")
-    outcome = simulate(policy, args.robot, script, substeps)
+    outcome = simulate(policy, spec, script, substeps)
     fate = f"fell after {outcome.survived_s:.1f} s" if outcome.fell else f"stood for all of {outcome.survived_s:.1f} s"
-    print(f"{args.robot}: {fate}, physics step {args.physics_dt:g} s")
+    print(f"{spec.name}: {fate}, physics step {args.physics_dt:g} s")
     for (name, unit), error in zip(ERRORS, outcome.errors, strict=True):
         print(f"  {name:<8}{error:7.3f} {unit}")
     return 0
 
 
-def simulate(policy: OnnxPolicy, robot: str, script: CommandScript, substeps: int) -> Outcome:
+def simulate(policy: OnnxPolicy, spec: RobotSpec, script: CommandScript, substeps: int) -> Outcome:
     """Follow a script until its end or a fall."""
     import mujoco
     import numpy as np
 
-    model = _model(policy, robot, policy.contract.step_dt / substeps)
+    model = _model(policy, spec, policy.contract.step_dt / substeps)
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, 0)
     mujoco.mj_forward(model, data)
@@ -92,16 +95,14 @@ def simulate(policy: OnnxPolicy, robot: str, script: CommandScript, substeps: in
     return Outcome(np.mean(errors, axis=0), float(data.time), fell=False)
 
 
-def _model(policy: OnnxPolicy, robot: str, physics_dt: float) -> mujoco.MjModel:
+def _model(policy: OnnxPolicy, spec: RobotSpec, physics_dt: float) -> mujoco.MjModel:
     """The robot on a floor, with MuJoCo's own solver settings and the contract's gains."""
     from eagle_rl.config.schema import SimCfg
-    from envs.robots.load import load_robot
     from envs.robots.model import build_model
 
     sim = SimCfg(physics_dt=physics_dt, decimation=1, solver_iterations=100, solver_ls_iterations=50)
-    spec = load_robot(robot)
     if spec.joint_names != policy.robot.joints:
-        raise ConfigError(f"{robot}: its joints are not those of the policy's contract; export the policy again.")
+        raise ConfigError(f"{spec.name}: its joints are not those of the policy's contract; export the policy again.")
     model = build_model(spec, sim)
     model.actuator_gainprm[:, 0] = policy.robot.stiffness
     model.actuator_biasprm[:, 1] = [-gain for gain in policy.robot.stiffness]

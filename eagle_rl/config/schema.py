@@ -315,7 +315,7 @@ class AidsCfg:
     gait_shaping_decay: float = 0.02
     """Relative decay of gait shaping per ``interval_steps`` while contacts match the clock."""
     interval_steps: int = 24
-    """Control steps between updates of both scales."""
+    """Control steps between updates of both scales, and between entries in the environment's log."""
     min_episode_ratio: float = 0.6
     """The harness decays while the mean episode lasts this share of its full length."""
     harness_contact_match: float = 0.7
@@ -406,6 +406,8 @@ class PlanCfg:
     """Budget of each specialist, per round."""
     distill_env_steps: int = 0
     """Budget of each distillation, per round."""
+    base_env_steps: int = 0
+    """Budget of COMPASS's base policy, which imitates the root."""
     max_rounds: int = 1
     """Rounds of specialise and generalise; 1 is the paper's EAGLE, more its "w/ ID"."""
     tolerance: float = 0.01

@@ -61,6 +61,8 @@ class EvaluationResult:
     robots: Mapping[str, RobotMetrics]
     seed: int
     """Seed of the training run."""
+    env_steps: int | None = None
+    """Environment steps the policy has cost, if known."""
 
     def to_json(self) -> str:
         """One JSON document."""
@@ -79,6 +81,7 @@ class EvaluationResult:
             protocol=EvaluationCfg(**data["protocol"]),
             robots={name: RobotMetrics.from_dict(robot) for name, robot in data["robots"].items()},
             seed=data["seed"],
+            env_steps=data["env_steps"],
         )
 
     @classmethod

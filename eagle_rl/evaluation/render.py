@@ -7,7 +7,7 @@ import dataclasses
 import io
 import json
 
-from eagle_rl.evaluation.report import Cell, Table
+from eagle_rl.evaluation.report import Cell, Row, Table
 
 SYMBOLS = ("E_vx", "E_vy", "E_w", "E_h", "E_p")
 UNITS = ("m/s", "m/s", "rad/s", "m", "rad")
@@ -43,9 +43,20 @@ def _percent(cell: Cell | None) -> str:
     return "-" if cell is None or cell.mean is None else f"{100 * cell.mean:.1f} %"
 
 
+def _millions(row: Row) -> str:
+    return "-" if row.env_steps is None else f"{row.env_steps / 1e6:.1f}"
+
+
 def to_markdown(table: Table) -> str:
     """GitHub Markdown, one table for all robots; the paper's numbers in brackets."""
-    head = ["robot", "method", *(f"{s} [{u}]" for s, u in zip(SYMBOLS, UNITS, strict=True)), "survival", "seeds"]
+    head = [
+        "robot",
+        "method",
+        *(f"{s} [{u}]" for s, u in zip(SYMBOLS, UNITS, strict=True)),
+        "survival",
+        "seeds",
+        "M steps",
+    ]
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     best = _best(table)
     for row in table.rows:
@@ -53,12 +64,12 @@ def to_markdown(table: Table) -> str:
             f"**{_text(cell)}**" if (row.robot, row.method, d) in best else _text(cell)
             for d, cell in enumerate(row.cells)
         ]
-        cells = [row.robot, row.method, *errors, _percent(row.survival), str(len(row.seeds) or "-")]
+        cells = [row.robot, row.method, *errors, _percent(row.survival), str(len(row.seeds) or "-"), _millions(row)]
         lines.append("| " + " | ".join(cells) + " |")
     hashes = [f"- {method}: {', '.join(h[:12] for h in hashes)}" for method, hashes in table.checkpoints.items()]
     note = (
         "Bold: the lowest of a robot's judged methods. In brackets: the paper's number. "
-        "± is the standard deviation over training seeds."
+        "± is the standard deviation over training seeds. M steps: millions of environment steps a seed has cost."
     )
     return "\n".join([*lines, "", table.caption, note, "", "Checkpoints (sha256):", "", *hashes, ""])
 
@@ -68,11 +79,13 @@ def to_csv(table: Table) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     kinds = ("", "_std", "_paper")
-    writer.writerow(["robot", "method", *(s + kind for s in SYMBOLS for kind in kinds), "survival", "num_seeds"])
+    writer.writerow(
+        ["robot", "method", *(s + kind for s in SYMBOLS for kind in kinds), "survival", "num_seeds", "env_steps"]
+    )
     for row in table.rows:
         values = [value for cell in row.cells for value in (cell.mean, cell.std, cell.paper)]
         survival = row.survival.mean if row.survival else None
-        writer.writerow([row.robot, row.method, *values, survival, len(row.seeds)])
+        writer.writerow([row.robot, row.method, *values, survival, len(row.seeds), row.env_steps])
     return text.getvalue()
 
 

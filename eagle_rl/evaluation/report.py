@@ -38,6 +38,8 @@ class Row:
     survival: Cell | None = None
     seeds: tuple[int, ...] = ()
     """Training seeds; empty for a reference row."""
+    env_steps: float | None = None
+    """Mean cost of a seed, if known."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,4 +140,5 @@ def _row(
         cells=tuple(_over_seeds([e[d] for e in errors], printed[d]) for d in range(len(COMMANDS))),
         survival=_over_seeds([run.robots[robot].survival for run in runs]),
         seeds=tuple(run.seed for run in runs),
+        env_steps=_over_seeds([run.env_steps for run in runs]).mean,
     )

@@ -24,7 +24,7 @@ def find_checkpoint(path: Path) -> Path:
         return path if path.suffix == SUFFIX else path.with_suffix(".pt")
     folders = [path, path / "checkpoints"]
     if (path / "plan.json").exists():
-        generalists = [stage.name for stage in read_plan(path) if stage.kind != "specialist"]
+        generalists = [stage.name for stage in read_plan(path) if not stage.specialised]
         folders = [stage_dir(path, name) / "checkpoints" for name in reversed(generalists)]
     for folder in folders:
         found = latest_checkpoint(folder)

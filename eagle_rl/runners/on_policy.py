@@ -22,7 +22,7 @@ from eagle_rl.errors import CheckpointError, HealthError, Interrupted
 from eagle_rl.models import EagleActor
 from eagle_rl.models.actor import ACTOR_INPUTS
 from eagle_rl.runners import checkpoint as ckpt
-from eagle_rl.runners.health import require_finite
+from eagle_rl.runners.health import SickRule, require_finite
 from eagle_rl.runners.interrupt import InterruptGuard
 from eagle_rl.runners.progress import ProgressReport
 from eagle_rl.runners.provenance import Provenance
@@ -86,6 +86,8 @@ class EagleRunner(OnPolicyRunner):
         self.folder = Path(log_dir) if log_dir is not None and self.gpu_global_rank == 0 else None
         self.robot = env.get_observations()["robot"].to(device)
         self.logger = TrainingLog(self.folder, self.robot, env.robot_names)
+        env.fault_folder = self.folder / "faults" if self.folder is not None else None
+        self._sick_rule = SickRule(self._env_steps_per_robot(), env.fault_folder)
         self.env_steps = 0
         self.wall_time = 0.0
         self._score: float | None = None
@@ -125,6 +127,7 @@ class EagleRunner(OnPolicyRunner):
                 while self.current_learning_iteration < last:
                     scalars = self._iterate()
                     self.logger.write(self.current_learning_iteration, scalars)
+                    self._sick_rule.check(scalars)
                     if self.gpu_global_rank == 0:
                         progress.update(self.current_learning_iteration, self.env_steps, scalars)
                     self._score = scalars.get("Train/mean_reward")
@@ -166,6 +169,12 @@ class EagleRunner(OnPolicyRunner):
             "Perf/wall_time": self.wall_time,
         }
         return self.logger.collect() | losses | own
+
+    def _env_steps_per_robot(self) -> dict[str, int]:
+        """Environment steps of each robot in an iteration of this process."""
+        counts = torch.bincount(self.robot, minlength=len(self.env.robot_names)).tolist()
+        steps: int = self.cfg["num_steps_per_env"]
+        return {name: n * steps for name, n in zip(self.env.robot_names, counts, strict=True)}
 
     def _step(self) -> None:
         """One control step of every environment."""

@@ -12,9 +12,8 @@ from pathlib import Path
 from typing import Literal
 
 from eagle_rl.config.schema import ExperimentCfg, TaskCfg
-from eagle_rl.errors import ConfigError
 
-Kind = Literal["root", "generalist", "continued", "specialist", "distill"]
+Kind = Literal["root", "generalist", "continued", "specialist", "distill", "base", "residual"]
 Imitation = Literal["eagle", "kickstart"]
 
 
@@ -36,17 +35,26 @@ class Stage:
     teachers: tuple[str, ...] = ()
     """Specialist stage of each robot, in the order of ``robots``."""
     imitation: Imitation | None = None
+    base: str | None = None
+    """Stage whose policy's actions the specialists' are added to (COMPASS)."""
+    demonstrations: bool = False
+    """Whether the teachers act instead of the policy, and nothing but imitation is learned (COMPASS)."""
     seed: int
 
     @property
     def inputs(self) -> tuple[str, ...]:
         """Stages that must be done first."""
-        return (*(() if self.init is None else (self.init,)), *self.teachers)
+        return tuple(dict.fromkeys(name for name in (self.init, self.base, *self.teachers) if name is not None))
 
     @property
     def warm(self) -> bool:
-        """Whether the policy has been through the curriculum already."""
-        return self.init is not None
+        """Whether the curricula have been passed before."""
+        return self.kind != "generalist"
+
+    @property
+    def specialised(self) -> bool:
+        """Whether it ends with a policy for one robot, out of a policy for all."""
+        return self.kind in ("specialist", "residual")
 
 
 def warm_task(task: TaskCfg) -> TaskCfg:
@@ -98,6 +106,46 @@ def _round(cfg: ExperimentCfg, number: int, generalist: str) -> list[Stage]:
     return [*specialists, distill]
 
 
+def _compass(cfg: ExperimentCfg, demonstrator: str) -> list[Stage]:
+    """The three stages of COMPASS after its demonstrations' author."""
+    plan = cfg.plan
+    base = _stage(
+        cfg,
+        "compass/base",
+        "base",
+        plan.base_env_steps,
+        round=1,
+        teachers=(demonstrator,) * len(cfg.robots),
+        imitation="kickstart",
+        demonstrations=True,
+    )
+    residuals = [
+        _stage(
+            cfg,
+            f"compass/residual_{Path(robot).stem}",
+            "residual",
+            plan.specialist_env_steps,
+            round=1,
+            robots=(robot,),
+            base=base.name,
+        )
+        for robot in cfg.robots
+    ]
+    distill = _stage(
+        cfg,
+        "compass/distill",
+        "distill",
+        plan.distill_env_steps,
+        round=1,
+        init=base.name,
+        base=base.name,
+        teachers=tuple(stage.name for stage in residuals),
+        imitation="kickstart",
+        demonstrations=True,
+    )
+    return [base, *residuals, distill]
+
+
 def plan_stages(cfg: ExperimentCfg, processes: int = 1) -> list[Stage]:
     """Every stage the experiment may run, in order; rounds after convergence are left out while running.
 
@@ -105,8 +153,6 @@ def plan_stages(cfg: ExperimentCfg, processes: int = 1) -> list[Stage]:
     """
     cfg = replace(cfg, num_envs=cfg.num_envs * processes)
     plan = cfg.plan
-    if plan.method == "compass":
-        raise ConfigError("plan.method: compass is not built; choose ppo, eagle or kickstarting.")
     if plan.root is None:
         stages = [_stage(cfg, "generalist", "generalist", plan.generalist_env_steps)]
     else:
@@ -115,6 +161,8 @@ def plan_stages(cfg: ExperimentCfg, processes: int = 1) -> list[Stage]:
         if plan.root is not None:
             stages.append(_stage(cfg, "continued", "continued", plan.generalist_env_steps, init="root"))
         return stages
+    if plan.method == "compass":
+        return [*stages, *_compass(cfg, stages[0].name)]
     for number in range(1, plan.max_rounds + 1):
         generalist = stages[-1].name
         stages += _round(cfg, number, generalist)

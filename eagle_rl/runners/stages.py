@@ -87,7 +87,7 @@ def run_experiment(
             helper.join()
     records = {stage.name: read_record(run_dir, stage.name) for stage in stages}
     active = active_stages(stages, records, cfg.plan.tolerance)
-    generalist = [stage for stage in active if stage.kind != "specialist"][-1]
+    generalist = [stage for stage in active if not stage.specialised][-1]
     return RunResult(run_dir=run_dir, generalist=final_checkpoint(run_dir, generalist.name), records=records)
 
 

@@ -11,12 +11,18 @@ from typing import Any
 
 from rsl_rl.env import VecEnv
 
+from eagle_rl.algorithms.specialists import SpecialistBank
 from eagle_rl.config.schema import ExperimentCfg, TaskCfg
 from eagle_rl.errors import CheckpointError
+from eagle_rl.evaluation.evaluate import Policy
+from eagle_rl.models import EagleActor
 from eagle_rl.runners.checkpoint import latest_checkpoint, load_actor, read_manifest, verify_checkpoint
+from eagle_rl.runners.compass import DemonstrationEnv, ResidualBank, ResidualEnv, ResidualPolicy, begin_residual
+from eagle_rl.runners.locate import find_checkpoint
 from eagle_rl.runners.on_policy import EagleRunner, make_train_cfg
 from eagle_rl.runners.plan import Stage, warm_task
 from eagle_rl.runners.provenance import Provenance
+from eagle_rl.runners.published import SUFFIX
 
 MakeEnv = Callable[[Sequence[str], int, TaskCfg, int], Any]
 """Builds an environment from robot names, number of environments, task and seed; picklable for several jobs."""
@@ -35,6 +41,8 @@ class Job:
     """Checkpoint whose weights to start from."""
     teachers: tuple[Path, ...]
     """Final checkpoint of each robot's specialist."""
+    base: Path | None
+    """Checkpoint of the policy whose actions the specialists' are added to."""
     make_env: MakeEnv
     provenance: Provenance
     check_claim: Callable[[], None]
@@ -47,7 +55,10 @@ class Job:
 def stage_cfg(cfg: ExperimentCfg, stage: Stage) -> ExperimentCfg:
     """The experiment as one stage sees it: its robots and its task."""
     task = warm_task(cfg.task) if stage.warm else cfg.task
-    return dataclasses.replace(cfg, robots=stage.robots, task=task)
+    algo = cfg.algo
+    if stage.demonstrations:
+        algo = dataclasses.replace(algo, use_ppo_loss=False, kickstart_coef=1.0, kickstart_decay=0.0)
+    return dataclasses.replace(cfg, robots=stage.robots, task=task, algo=algo)
 
 
 def train(job: Job) -> Path:
@@ -72,19 +83,46 @@ def _make_runner(job: Job) -> EagleRunner:
     """The runner of a stage, its specialists loaded."""
     cfg, stage = job.cfg, job.stage
     env: VecEnv = job.make_env(stage.robots, cfg.num_envs, cfg.task, stage.seed + job.rank)
+    base = _load(job.base, job)
+    bank = _teachers(job, base)
     history = cfg.task.observations.history_length
+    if bank is not None and stage.demonstrations:
+        env = DemonstrationEnv(env, bank, env.get_observations()["history"].shape[1] // history)
+    elif base is not None:
+        env = ResidualEnv(env, base)
     train_cfg = make_train_cfg(cfg.algo, cfg.run, history_length=history, seed=stage.seed)
     runner = EagleRunner(env, train_cfg, job.folder, cfg.run.device, job.provenance)
-    if stage.imitation is not None:
-        runner.imitate([load_actor(path)[0] for path in job.teachers], stage.imitation)
+    if bank is not None and stage.imitation is not None:
+        runner.alg.imitate(bank, stage.imitation)
+    if base is not None and stage.kind == "residual":
+        begin_residual(runner.alg.actor, base)
     return runner
+
+
+def _load(path: Path | None, job: Job) -> EagleActor | None:
+    return None if path is None else load_actor(path, job.cfg.run.device)[0]
+
+
+def _teachers(job: Job, base: EagleActor | None) -> SpecialistBank | None:
+    """The specialists of a stage that has any."""
+    actors = [load_actor(path, job.cfg.run.device)[0] for path in job.teachers]
+    if not actors:
+        return None
+    return SpecialistBank(actors) if base is None else ResidualBank(base, actors)
+
+
+def load_policy(job: Job, checkpoint: Path) -> Policy:
+    """The deterministic policy a stage ended with."""
+    actor = load_actor(checkpoint, job.cfg.run.device)[0]
+    base = _load(job.base, job) if job.stage.kind == "residual" else None
+    return actor if base is None else ResidualPolicy(base, actor)
 
 
 def _copy_root(job: Job, checkpoints: Path) -> Path:
     """Take the experiment's root checkpoint into the run, so that the run is complete without it."""
-    source = Path(job.cfg.plan.root or "").with_suffix(".pt")
-    if not source.exists():
-        raise CheckpointError(f"plan.root: {source}: no such checkpoint.")
+    source = find_checkpoint(Path(job.cfg.plan.root or ""))
+    if source.suffix == SUFFIX:
+        raise CheckpointError(f"plan.root: {source}: a published policy has no critic to go on from; use a checkpoint.")
     verify_checkpoint(source)
     checkpoints.mkdir(parents=True, exist_ok=True)
     for suffix in (".pt", ".json"):  # the manifest last: what has one is complete

@@ -13,7 +13,7 @@ from eagle_rl.config.schema import ExperimentCfg
 from eagle_rl.evaluation.evaluate import EvaluationResult, evaluate
 from eagle_rl.evaluation.report import pooled_score
 from eagle_rl.models.precision import set_up_torch
-from eagle_rl.runners.checkpoint import load_actor, load_checkpoint, read_manifest
+from eagle_rl.runners.checkpoint import load_checkpoint, read_manifest
 from eagle_rl.runners.claims import Claim, ClaimLostError
 from eagle_rl.runners.files import write_atomically
 from eagle_rl.runners.judged import RESULT
@@ -21,7 +21,7 @@ from eagle_rl.runners.plan import Stage
 from eagle_rl.runners.provenance import Provenance
 from eagle_rl.runners.records import Record, active_stages, final_checkpoint, read_record, stage_dir, write_record
 from eagle_rl.runners.team import Team
-from eagle_rl.runners.training import Job, MakeEnv, stage_cfg, train
+from eagle_rl.runners.training import Job, MakeEnv, load_policy, stage_cfg, train
 
 POLL_S = 1.0
 """Wait of a worker for whom there is nothing to do yet [s]."""
@@ -107,6 +107,7 @@ class Worker:
             folder=stage_dir(self.run_dir, stage.name),
             init=None if stage.init is None else inputs[stage.init],
             teachers=tuple(inputs[name] for name in stage.teachers),
+            base=None if stage.base is None else inputs[stage.base],
             make_env=self.make_env,
             provenance=provenance,
             check_claim=check_claim,
@@ -137,9 +138,10 @@ class Worker:
         cfg = job.cfg
         if cfg.plan.judge_envs_per_robot == 0:
             return None
-        actor, manifest = load_actor(checkpoint, cfg.run.device)
         ev = dataclasses.replace(cfg.evaluation, num_envs_per_robot=cfg.plan.judge_envs_per_robot)
-        robots = evaluate(actor, self.make_env, cfg.robots, cfg.task, ev)
-        result = EvaluationResult(checkpoint=manifest["sha256"], protocol=ev, robots=robots, seed=cfg.seed)
+        robots = evaluate(load_policy(job, checkpoint), self.make_env, cfg.robots, cfg.task, ev)
+        result = EvaluationResult(
+            checkpoint=read_manifest(checkpoint)["sha256"], protocol=ev, robots=robots, seed=cfg.seed
+        )
         write_atomically(job.folder / RESULT, result.to_json().encode())
         return pooled_score(robots)

@@ -12,10 +12,10 @@ from eagle_rl.config.schema import RandomizationCfg, Range
 
 from ..geometry import quat_from_yaw
 from ..rng import CounterRng
-from ..robots.embodiment import EMBODIMENT_LINKS, BodyChanges
 from ..robots.slots import NUM_SLOTS
 from ..sim.pool import PhysicsPool
 from ..state import PooledRobots
+from .bodies import draw_morphology, randomize_bodies, resized
 
 NOMINAL_FRICTION = 1.0
 SPAWN_CLEARANCE = 0.04
@@ -29,9 +29,12 @@ class Randomizer:
         """Draw the bodies of every environment; the rest follows at each reset."""
         self.cfg = cfg
         self._pool = pool
-        self._robots = robots
         self._rng = rng
-        mass = robots.total_mass
+        length, mass = draw_morphology(cfg, robots, rng)
+        self.robots = resized(robots, length, mass)
+        """The robots as their morphology makes them."""
+        self.bodies = randomize_bodies(cfg, pool, self.robots, rng, length, mass)
+        """What became of the links that o_ea describes."""
         num_envs = len(mass)
         self.friction = torch.full_like(mass, NOMINAL_FRICTION)
         """Friction coefficient, shape (N,)."""
@@ -41,7 +44,6 @@ class Randomizer:
         """Age of the proprioception as a share of the control step, shape (N, 1)."""
         self._stiffness_scale = mass.new_ones(num_envs, NUM_SLOTS)
         self._damping_scale = mass.new_ones(num_envs, NUM_SLOTS)
-        self.bodies = self._randomize_bodies()
 
     def reset(self, ids: Tensor, count: Tensor, step_dt: float) -> None:
         """Redraw what is redrawn at each reset for some environments, ``count`` being their episode numbers."""
@@ -60,7 +62,7 @@ class Randomizer:
             (cfg.damping_scale, NUM_SLOTS),
         )
         self.friction[ids] = friction.squeeze(1)
-        self.motor_offset[ids] = motor_offset * self._robots.slot_mask[ids]
+        self.motor_offset[ids] = motor_offset * self.robots.slot_mask[ids]
         self.latency[ids] = latency / step_dt
         self._stiffness_scale[ids] = strength * stiffness
         self._damping_scale[ids] = strength * damping
@@ -68,7 +70,7 @@ class Randomizer:
 
     def initial_state(self, ids: Tensor, count: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Draw initial states: root (n, 13), canonical joint positions [rad] and velocities [rad/s] (n, 32)."""
-        robots = self._robots.rows(ids)
+        robots = self.robots.rows(ids)
         root = robots.total_mass.new_zeros(len(ids), 13)
         root[:, 2] = robots.nominal_height + SPAWN_CLEARANCE * self.cfg.enabled
         root[:, 3] = 1.0
@@ -125,30 +127,3 @@ class Randomizer:
             spec = batch.spec
             batch.set_friction(local, friction[at])
             batch.set_gains(local, spec.stiffness * kp[at][:, spec.slots], spec.damping * kd[at][:, spec.slots])
-
-    def _randomize_bodies(self) -> BodyChanges:
-        """Scale masses and shift centres of mass of every body of every environment, once."""
-        mass = self._robots.total_mass
-        shape = (len(mass), len(EMBODIMENT_LINKS))
-        changes = BodyChanges(mass.new_ones(shape), mass.new_zeros(shape), mass.new_zeros(*shape, 3))
-        if not self.cfg.enabled:
-            return changes
-        for batch, rows in zip(self._pool.batches, self._pool.rows, strict=True):
-            ids = torch.arange(rows.start, rows.stop, device=mass.device)
-            model, num_bodies = batch.model, batch.model.nbody
-            once = torch.zeros_like(ids)
-            scale = self._rng.uniform_in(*self.cfg.link_mass_scale, "link_mass", once, num_bodies, ids)
-            offset = self._rng.uniform_in(*self.cfg.link_com_offset, "link_com", once, 3 * num_bodies, ids)
-            offset = offset.reshape(-1, num_bodies, 3)
-            payload = self._rng.uniform_in(*self.cfg.base_mass_ratio, "base_mass", once, 1, ids).squeeze(1)
-            shift = self._rng.uniform_in(*self.cfg.base_com_offset, "base_com", once, 2, ids)
-            added = torch.zeros_like(scale)
-            base = model.body(batch.spec.base_link).id
-            added[:, base] = payload * batch.spec.total_mass
-            offset[:, base, :2] += shift
-            batch.scale_bodies(*(x.to("cpu", torch.float64).numpy() for x in (scale, added, offset)))
-            bodies = [model.body(batch.spec.link_roles[role]).id for role in EMBODIMENT_LINKS]
-            changes.mass_scale[rows] = scale[:, bodies].to(mass.dtype)
-            changes.added_mass[rows] = added[:, bodies].to(mass.dtype)
-            changes.com_offset[rows] = offset[:, bodies].to(mass.dtype)
-        return changes

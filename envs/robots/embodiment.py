@@ -21,7 +21,7 @@ from eagle_rl.config.schema import RandomizationCfg
 
 from .load import load_robot
 from .spec import Array, RobotSpec
-from .structure import STRUCTURE_DIM, structure_vector
+from .structure import STRUCTURE_DIM, resized_structure, structure_vector
 
 Descriptor = Literal["paper", "extended"]
 
@@ -43,6 +43,8 @@ _MASS_FLOOR, _INERTIA_FLOOR = 0.1, 0.1
 class BodyChanges:
     """What randomization did to ``EMBODIMENT_LINKS`` of each environment."""
 
+    length_scale: Tensor
+    """Factor on all lengths, shape (N,); inertia grows with its square."""
     mass_scale: Tensor
     """Factor on mass and inertia, shape (N, 3)."""
     added_mass: Tensor
@@ -76,8 +78,10 @@ def embodiment_vector(nominal: Tensor, changes: BodyChanges) -> Tensor:
     An added point mass at the centre of mass changes neither its place nor the inertia about it.
     """
     scale = changes.mass_scale.unsqueeze(-1)
+    length = changes.length_scale.reshape(-1, 1, 1)
     mass = nominal[..., :1] * scale + changes.added_mass.unsqueeze(-1)
-    return torch.cat([mass, nominal[..., 1:4] + changes.com_offset, nominal[..., 4:] * scale], dim=-1).flatten(1)
+    centre = nominal[..., 1:4] * length + changes.com_offset
+    return torch.cat([mass, centre, nominal[..., 4:] * scale * length.square()], dim=-1).flatten(1)
 
 
 def embodiment_dim(descriptor: Descriptor) -> int:
@@ -103,7 +107,7 @@ def pooled_embodiment(
     if descriptor == "paper":
         return rows
     structure = like.new_tensor(np.stack([structure_vector(spec) for spec in robots]))
-    return torch.cat([rows, structure[robot_id]], dim=1)
+    return torch.cat([rows, resized_structure(structure[robot_id], changes.length_scale)], dim=1)
 
 
 @cache

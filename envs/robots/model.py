@@ -51,11 +51,20 @@ def build_model(spec: RobotSpec, sim: SimCfg, heightfield: HeightField | None = 
         world = build_spec(spec, sim)
         add_floor(world, heightfield)
         add_sensors(world, spec)
-        return world.compile()
+        return _with_movable_centres(world.compile())
     except RobotError:
         raise
     except ValueError as error:
         raise RobotError(f"{spec.yaml_path}: MuJoCo refuses the robot: {error}") from error
+
+
+def _with_movable_centres(model: mujoco.MjModel) -> mujoco.MjModel:
+    """Drop MuJoCo's shortcuts for frames that coincide with a centre of mass: randomization moves the centres."""
+    model.body_sameframe[1:] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
+    for frames in (model.geom_sameframe, model.site_sameframe):
+        frames[frames == mujoco.mjtSameFrame.mjSAMEFRAME_INERTIA] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
+        frames[frames == mujoco.mjtSameFrame.mjSAMEFRAME_INERTIAROT] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
+    return model
 
 
 def build_spec(spec: RobotSpec, sim: SimCfg, *, visuals: bool = False) -> mujoco.MjSpec:
@@ -129,7 +138,9 @@ def set_options(world: mujoco.MjSpec, sim: SimCfg) -> None:
     option.iterations = sim.solver_iterations
     option.ls_iterations = sim.solver_ls_iterations
     option.tolerance = 1e-8
-    option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ISLAND) | int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+    disable = mujoco.mjtDisableBit
+    option.disableflags |= int(disable.mjDSBL_ISLAND) | int(disable.mjDSBL_AUTORESET)
+    option.disableflags |= int(disable.mjDSBL_MIDPHASE)  # its boxes do not follow a centre of mass that is moved
 
 
 def _add_body(parent: mujoco.MjsBody, body: Body, spec: RobotSpec) -> mujoco.MjsBody:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from .slots import MIRROR_PERMUTATION, MIRROR_SIGN, NUM_SLOTS, SLOT_INDEX
 from .spec import FEET, Array, RobotSpec
@@ -40,6 +42,14 @@ def structure_vector(spec: RobotSpec) -> Array:
             spec.to_slots((spec.signs[:, None] * axes).T).T.ravel(),
         ]
     )
+
+
+def resized_structure(rows: Tensor, length_scale: Tensor) -> Tensor:
+    """Describe robots whose lengths are multiplied by a factor, shapes (N, 165) and (N,); only limbs change."""
+    scale = length_scale.unsqueeze(1)
+    centre = rows.new_tensor(_LIMB_MEAN / _LIMB_STD)
+    limbs = (rows[:, : len(LIMBS)] + centre) * scale - centre
+    return torch.cat([limbs, rows[:, len(LIMBS) :]], dim=1)
 
 
 def structure_mirror() -> tuple[tuple[int, ...], tuple[float, ...]]:

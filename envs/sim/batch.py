@@ -66,7 +66,7 @@ class RobotBatch:
 
         A simulation with a target that is not finite keeps the targets it had, and is reported in ``causes``.
         """
-        wild = ~np.isfinite(targets).all(axis=1)
+        wild = ~np.isfinite(targets.sum(axis=1))
         np.copyto(self.ctrl, targets, where=~wild[:, None])
         warned = self.advance()
         self._recorder.add(self._batch.state)
@@ -127,18 +127,31 @@ class RobotBatch:
         self._batch.expand("dof_damping")[ids, 6:] = damping
         self._kd = self._batch.expand("dof_damping")[:, 6:]
 
-    def scale_bodies(self, mass_scale: Array, added_mass: Array, com_offset: Array) -> None:
+    def change_bodies(self, length_scale: Array, mass_scale: Array, added_mass: Array, com_offset: Array) -> None:
         """Change every simulation's bodies once, then recompute the constants MuJoCo derives from them.
 
         Args:
+            length_scale: factor on all lengths of the robot, shape (n,); inertia grows with its square.
             mass_scale: factor on mass and inertia of each body, shape (n, nbody).
             added_mass: mass added at the centre of mass [kg], shape (n, nbody).
             com_offset: shift of the centre of mass in the body frame [m], shape (n, nbody, 3).
         """
+        length = length_scale[:, None, None]
         self._batch.expand("body_mass")[:] = self.model.body_mass * mass_scale + added_mass
-        self._batch.expand("body_inertia")[:] = self.model.body_inertia * mass_scale[..., None]
-        self._batch.expand("body_ipos")[:] = self.model.body_ipos + com_offset
+        self._batch.expand("body_inertia")[:] = self.model.body_inertia * mass_scale[..., None] * length**2
+        self._batch.expand("body_ipos")[:] = self.model.body_ipos * length + com_offset
+        if (length_scale != 1.0).any():
+            self._scale_geometry(length_scale)
         self._batch.set_const()
+
+    def _scale_geometry(self, scale: Array) -> None:
+        """Multiply every length of the robot, but not of the ground, by a factor, shape (n,)."""
+        model = self.model
+        owners = {"body_pos": np.arange(model.nbody), "jnt_pos": model.jnt_bodyid, "site_pos": model.site_bodyid}
+        owners |= dict.fromkeys(("geom_pos", "geom_size", "geom_rbound"), model.geom_bodyid)
+        for name, bodies in owners.items():
+            nominal = getattr(model, name)[bodies > 0]
+            self._batch.expand(name)[:, bodies > 0] = np.multiply.outer(scale, nominal)
 
     def fault(self, env: int) -> Fault:
         """The last states of a simulation that ``causes`` names."""

@@ -69,4 +69,7 @@ def load_fault(path: Path) -> Fault:
     if rows == 0 or any(x.shape[:1] != (rows,) or x.ndim != 2 for name, x in arrays.items() if name != "time"):
         shapes = {name: x.shape for name, x in arrays.items()}
         raise ConfigError(f"{path}: not a fault file: got shapes {shapes}, expected one row per control step in each.")
-    return Fault(env=env, **words, **arrays)
+    return Fault(
+        robot=words["robot"], robot_file=words["robot_file"], cause=words["cause"], env=env,
+        time=arrays["time"], qpos=arrays["qpos"], qvel=arrays["qvel"], ctrl=arrays["ctrl"],
+    )  # fmt: skip

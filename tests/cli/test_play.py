@@ -15,6 +15,9 @@ from eagle_rl.cli.window import KEYS, STOP, Keyboard
 from eagle_rl.config.schema import CommandsCfg
 from eagle_rl.errors import CheckpointError, ConfigError, RobotError
 from envs.rendering.offscreen import gl_backends
+from envs.rendering.scene import default_qpos
+from envs.robots.load import load_robot
+from envs.sim.fault import Fault
 from tests.policy import untrained_checkpoint
 
 needs_gl = pytest.mark.skipif(not gl_backends(), reason="this machine has no EGL and no OSMesa")
@@ -96,6 +99,35 @@ def test_a_caption_names_all_five_commands():
     assert caption(3.0, np.array([0.5, -0.1, 1.0, -0.2, 0.3])).split() == (
         "3.0 s forward +0.50 m/s left -0.10 m/s turn +1.00 rad/s height -0.20 m pitch +0.30 rad".split()
     )
+
+
+def fault_file(folder):
+    spec = load_robot("t1")
+    qpos = np.tile(default_qpos(spec), (4, 1))
+    qvel = np.zeros((4, 6 + spec.num_joints))
+    qvel[2, 8] = -321.0
+    qpos[3, 0] = np.nan
+    arrays = {"time": np.arange(4) * 0.02, "qpos": qpos, "qvel": qvel, "ctrl": qpos[:, 7:]}
+    fault = Fault(robot="t1", robot_file=str(spec.yaml_path), cause="velocity", env=5, **arrays)
+    return fault.save(folder), spec.joint_names[2]
+
+
+def test_a_fault_is_told_state_by_state_without_graphics(tmp_path, capsys):
+    path, joint = fault_file(tmp_path)
+    assert play.main(["--replay-fault", str(path)]) == 0
+    told = capsys.readouterr().out.splitlines()
+    assert "t1, environment 5: velocity" in told[0]
+    assert f"{joint} 321.0 rad/s" in told[3]
+    assert "1 numbers are not finite" in told[4]
+
+
+@needs_gl
+def test_the_finite_states_of_a_fault_are_drawn(tmp_path):
+    path, _ = fault_file(tmp_path)
+    video, sheet = tmp_path / "f.mp4", tmp_path / "f.png"
+    assert play.main(["--replay-fault", str(path), "--video", str(video), "--contact-sheet", str(sheet)]) == 0
+    assert imageio_ffmpeg.count_frames_and_secs(str(video))[0] == 3
+    assert sheet.stat().st_size > 0
 
 
 def test_keys_move_the_command_inside_its_ranges_and_enter_stands_still():

@@ -11,10 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from eagle_rl.errors import ConfigError
-from envs.humanoid_env import LOG_INTERVAL, HumanoidEnv
+from envs.humanoid_env import HumanoidEnv
 from envs.sim.fault import MAX_FILES, load_fault
 from envs.sim.health import CAUSES, MAX_DISTANCE, MAX_HEIGHT, MAX_SPEED, FlightRecorder, diagnose
-from tests.envs.worlds import actions, assert_same, make_env, robot
+from tests.envs.worlds import LOG_INTERVAL, actions, assert_same, make_env, robot
 
 BAD = (float("nan"), float("inf"), -float("inf"), 1e12)
 SICK, STEPS = 3, 5

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from eagle_rl.config.schema import CommandsCfg, ObservationsCfg, TaskCfg, TerminationsCfg
 from eagle_rl.errors import ConfigError
-from envs.humanoid_env import LOG_INTERVAL, HumanoidEnv
+from envs.humanoid_env import HumanoidEnv
 from envs.mdp.observations import proprioception
-from tests.envs.worlds import BARE, actions, assert_same, make_env, rollout
+from tests.envs.worlds import BARE, LOG_INTERVAL, actions, assert_same, make_env, rollout
 
 FALLEN = (0.7071067811865476, 0.7071067811865476, 0.0, 0.0)
 SHORT = replace(TaskCfg(), terminations=TerminationsCfg(episode_length_s=0.2))

@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from eagle_rl.config.schema import AidsCfg, CommandsCfg, RandomizationCfg, TaskCfg, TerminationsCfg
-from envs.humanoid_env import LOG_INTERVAL, HumanoidEnv
-from tests.envs.worlds import BARE, actions, assert_same, make_env
+from envs.humanoid_env import HumanoidEnv
+from tests.envs.worlds import BARE, LOG_INTERVAL, actions, assert_same, make_env
 
 BUSY = replace(
     TaskCfg(),
@@ -79,7 +79,7 @@ def test_everything_happened_that_the_resume_test_is_about() -> None:
     falls = sum(int(out[2].sum()) for out in outs) - time_outs
     assert time_outs > 0
     assert falls > 0
-    assert (env.command_count > env.episode_count).all(), "commands were redrawn within an episode"
+    assert (env.commands.count > env.episode_count).all(), "commands were redrawn within an episode"
 
 
 def test_resumes_without_randomization_and_in_double_precision() -> None:

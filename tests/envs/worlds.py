@@ -25,6 +25,10 @@ BARE = TaskCfg(
 """Nothing random but commands, no help."""
 
 
+LOG_INTERVAL = TaskCfg().aids.interval_steps
+"""Control steps between entries in ``extras["log"]``."""
+
+
 @cache
 def robot(name: str) -> RobotSpec:
     return load_robot(name)

@@ -23,7 +23,13 @@ EV = EvaluationCfg(num_envs_per_robot=16, num_steps=2)
 def result(errors: tuple[float | None, ...], seed: int = 1, ev: EvaluationCfg = EV, robots=("h1",)) -> EvaluationResult:
     subset = TrackingErrors(share=1.0, errors=errors, charged=tuple(e and 2 * e for e in errors))
     metrics = RobotMetrics(num_envs=16, survival=0.5, upright=0.75, subsets=dict.fromkeys(SUBSETS, subset))
-    return EvaluationResult(checkpoint=f"{seed:064x}", protocol=ev, robots=dict.fromkeys(robots, metrics), seed=seed)
+    return EvaluationResult(
+        checkpoint=f"{seed:064x}",
+        protocol=ev,
+        robots=dict.fromkeys(robots, metrics),
+        seed=seed,
+        env_steps=2_000_000 * seed,
+    )
 
 
 def test_seeds_become_mean_and_standard_deviation():
@@ -33,6 +39,7 @@ def test_seeds_become_mean_and_standard_deviation():
     assert row.cells[0].std == pytest.approx(0.1 * 2**0.5)
     assert row.cells[1].std == pytest.approx(0.0)
     assert row.seeds == (1, 2)
+    assert row.env_steps == 3_000_000
 
 
 def test_the_papers_number_stands_beside_ours_only_for_its_methods_and_robots():

@@ -124,7 +124,7 @@ def test_the_runtime_runs_without_torch_and_without_the_simulation(exported):
 
 
 def test_plain_mujoco_tells_survival_and_errors(exported):
-    outcome = simulate(OnnxPolicy(exported[1], "n1"), "n1", parse_commands("- {t: 0}"), substeps=4)
+    outcome = simulate(OnnxPolicy(exported[1], "n1"), load_robot("n1"), parse_commands("- {t: 0}"), substeps=4)
     assert 0.0 < outcome.survived_s <= 2.0
     assert outcome.fell == (outcome.survived_s < 2.0)
     assert (outcome.errors >= 0).all()

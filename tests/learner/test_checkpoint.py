@@ -162,6 +162,15 @@ def test_pruning_keeps_the_last_the_best_and_the_ends_of_stages(tmp_path):
     assert ckpt.best_checkpoint(tmp_path).name == "model_2.pt"
 
 
+def test_a_reader_of_the_old_file_never_sees_the_new_one(tmp_path):
+    path = tmp_path / "file"
+    write_atomically(path, b"old")
+    with path.open("rb") as reader:
+        write_atomically(path, b"new")
+        assert reader.read() == b"old"
+    assert path.read_bytes() == b"new"
+
+
 def test_a_failed_write_leaves_the_old_file_whole(tmp_path, monkeypatch):
     path = tmp_path / "file"
     write_atomically(path, b"old")

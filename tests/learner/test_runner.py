@@ -95,6 +95,13 @@ def test_logged_rewards_and_lengths_are_those_of_finished_episodes():
     assert tags["Train/mean_reward/two"] == 3.0
     assert tags["Train/mean_reward"] == 2.5
     assert "Train/mean_reward/three" not in tags
+    episodes.add(torch.full((n,), -4.0), torch.ones(n, dtype=torch.bool))
+    tags = episodes.collect()
+    fresh = n // 3 - 1  # environments of robot one that had not finished before
+    lengths = [2.0, 2.0] + [4.0] * fresh  # the first has begun anew after two steps
+    assert tags["Train/mean_episode_length/one"] == pytest.approx(sum(lengths) / len(lengths))
+    rewards = [2.0, -3.0] + [-1.0] * fresh
+    assert tags["Train/mean_reward/one"] == pytest.approx(sum(rewards) / len(rewards))
 
 
 def test_a_resumed_run_equals_the_uninterrupted_one_bit_for_bit(tmp_path):
@@ -166,6 +173,14 @@ def test_weights_of_another_shape_are_refused_before_any_is_changed(tmp_path):
         with pytest.raises(CheckpointError, match=r"critic has other shapes.*\s+mlp\.0\.weight: \(3, 3\), expected"):
             load(bad)
     compare(before, parameters(runner), "parameters after a refusal")
+
+
+def test_a_checkpoint_of_another_number_of_processes_is_refused(tmp_path):
+    state = make_runner()._state()
+    state["processes"] *= 2
+    path = ckpt.save_checkpoint(tmp_path, state, Provenance(), iteration=1, env_steps=0)
+    with pytest.raises(CheckpointError, match="written by 2 processes, resumed by 1"):
+        make_runner().load(path)
 
 
 def test_a_stage_starts_from_the_weights_of_another_with_fresh_counters(tmp_path):

@@ -38,10 +38,12 @@ robots = pytest.mark.parametrize("name", ROBOTS)
 def _changes(rows: int, seed: int | None = None) -> BodyChanges:
     draw = torch.Generator().manual_seed(seed or 0)
     if seed is None:
-        return BodyChanges(*(torch.full((rows, 3), v, dtype=torch.float64) for v in (1, 0)), torch.zeros(rows, 3, 3))
+        scale, added = (torch.full((rows, 3), v, dtype=torch.float64) for v in (1, 0))
+        return BodyChanges(torch.ones(rows, dtype=torch.float64), scale, added, torch.zeros(rows, 3, 3))
     scale, added = (torch.rand(rows, 3, generator=draw, dtype=torch.float64) for _ in range(2))
     offset = torch.rand(rows, 3, 3, generator=draw, dtype=torch.float64) - 0.5
-    return BodyChanges(0.8 + 0.4 * scale, 3.0 * added, 0.02 * offset)
+    length = 0.8 + 0.4 * torch.rand(rows, generator=draw, dtype=torch.float64)
+    return BodyChanges(length, 0.8 + 0.4 * scale, 3.0 * added, 0.02 * offset)
 
 
 def test_boxes_have_their_textbook_mass_centre_and_inertia(tmp_path: Path) -> None:
@@ -86,8 +88,8 @@ def test_randomized_values_are_those_the_physics_uses(name: str) -> None:
     for i, role in enumerate(EMBODIMENT_LINKS):
         body = model.body(spec.link_roles[role])
         body.mass = body.mass * float(changes.mass_scale[0, i]) + float(changes.added_mass[0, i])
-        body.inertia = body.inertia * float(changes.mass_scale[0, i])
-        body.ipos = body.ipos + changes.com_offset[0, i].numpy()
+        body.inertia = body.inertia * float(changes.mass_scale[0, i]) * float(changes.length_scale[0]) ** 2
+        body.ipos = body.ipos * float(changes.length_scale[0]) + changes.com_offset[0, i].numpy()
     nominal = torch.from_numpy(nominal_embodiment(spec)).unsqueeze(0)
     ours = embodiment_vector(nominal, changes).reshape(3, LINK_DIM)
     np.testing.assert_allclose(ours, _from_mujoco(model, name), atol=1e-9)
@@ -128,7 +130,7 @@ def test_default_randomization_of_all_five_robots_is_standardised() -> None:
     for i in base:
         rows = robot_id == i
         added[rows, 0] = specs[i].total_mass * (-0.058 + 0.232 * uniform[rows, 0, 4])
-    rows = pooled_embodiment(specs, robot_id, BodyChanges(scale, added, offset), "paper")
+    rows = pooled_embodiment(specs, robot_id, BodyChanges(torch.ones(5 * count), scale, added, offset), "paper")
     assert rows.mean(dim=0).abs().max() < 0.1
     std = rows.std(dim=0)
     assert std.max() < 1.05

@@ -13,12 +13,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from eagle_rl.config.schema import TaskCfg
+from eagle_rl.config.schema import ExperimentCfg, TaskCfg
 from eagle_rl.runners.plan import plan_stages
 from eagle_rl.runners.stages import run_experiment
 from tests.runners.toy_run import STEPS, JudgedToyEnv, parameters, toy_experiment
 
-CFG = toy_experiment(iterations=3)
+EAGLE = toy_experiment(iterations=3)
+COMPASS = toy_experiment(iterations=3, method="compass")
 MID_ITERATION = 2 * STEPS + 1
 """Control steps of a stage before its process dies: in its last iteration, two checkpoints written."""
 
@@ -48,11 +49,11 @@ class MakeEnv:
         return DeadlyEnv(num_envs, tuple(robots), seed, self.steps if seed == self.seed else None)
 
 
-def run_until_killed(folder: Path, seed: int, steps: int) -> None:
+def run_until_killed(cfg: ExperimentCfg, folder: Path, seed: int, steps: int) -> None:
     """Run or resume in a process of its own, which has to die."""
     fork = multiprocessing.get_context("fork")
     process = fork.Process(
-        target=run_experiment, args=(CFG, folder, MakeEnv(seed, steps)), kwargs={"resume": folder.exists()}
+        target=run_experiment, args=(cfg, folder, MakeEnv(seed, steps)), kwargs={"resume": folder.exists()}
     )
     process.start()
     process.join()
@@ -60,14 +61,14 @@ def run_until_killed(folder: Path, seed: int, steps: int) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded, use of fork")
-def test_killed_in_every_stage_a_run_ends_with_the_same_parameters(tmp_path):
-    torch.set_num_threads(1)
-    whole = run_experiment(CFG, tmp_path / "whole", MakeEnv(None, 0))
+@pytest.mark.parametrize("cfg", [EAGLE, COMPASS], ids=["eagle", "compass"])
+def test_killed_in_every_stage_a_run_ends_with_the_same_parameters(cfg, tmp_path):
+    whole = run_experiment(cfg, tmp_path / "whole", MakeEnv(None, 0))
     folder = tmp_path / "killed"
-    for stage in plan_stages(CFG):
-        run_until_killed(folder, stage.seed, MID_ITERATION)
-    run_until_killed(folder, CFG.evaluation.seed, 3)
-    killed = run_experiment(CFG, folder, MakeEnv(None, 0), resume=True)
+    for stage in plan_stages(cfg):
+        run_until_killed(cfg, folder, stage.seed, MID_ITERATION)
+    run_until_killed(cfg, folder, cfg.evaluation.seed, 3)
+    killed = run_experiment(cfg, folder, MakeEnv(None, 0), resume=True)
     expected, found = parameters(whole), parameters(killed)
     assert expected.keys() == found.keys()
     assert all(torch.equal(expected[key], found[key]) for key in expected)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 
 from eagle_rl.errors import CheckpointError
-from eagle_rl.runners.judged import judged_results
+from eagle_rl.runners.judged import judged_results, training_steps
 from eagle_rl.runners.locate import find_checkpoint
 from eagle_rl.runners.records import read_plan, stage_dir
 from eagle_rl.runners.stages import run_experiment
-from tests.runners.toy_run import make_toy_env, toy_experiment
+from tests.runners.toy_run import ENVS, STEPS, make_toy_env, toy_experiment
 
 
 @pytest.fixture(scope="module")
@@ -41,3 +41,15 @@ def test_scores_of_a_run_are_rows_with_all_specialists_in_one(run):
     rows = judged_results(run.run_dir, read_plan(run.run_dir))
     assert list(rows) == ["generalist", "specialist, round 1", "generalist, round 1"]
     assert [list(result.robots) for result in rows["specialist, round 1"]] == [["one"], ["two"], ["three"]]
+
+
+def test_a_policy_costs_its_stage_and_all_it_was_made_from(run):
+    stage = 2 * ENVS * STEPS
+    specialist = find_checkpoint(stage_dir(run.run_dir, "round1/specialist_two"))
+    assert training_steps(run.run_dir / run.records["generalist"].checkpoint) == stage
+    assert training_steps(specialist) == 2 * stage
+    assert training_steps(run.generalist) == 5 * stage, "generalist, three specialists, distillation"
+
+
+def test_a_checkpoint_outside_of_a_run_has_no_known_cost(tmp_path):
+    assert training_steps(tmp_path / "model_1.pt") is None

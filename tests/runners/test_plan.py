@@ -9,7 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from eagle_rl.config.schema import ExperimentCfg, PlanCfg
-from eagle_rl.errors import ConfigError
 from eagle_rl.runners.plan import plan_stages, warm_task
 from eagle_rl.runners.records import Record, active_stages, converged_round
 
@@ -72,9 +71,14 @@ def test_robots_from_files_name_their_stage_by_the_stem():
     assert stages[1].name == "round1/specialist_bot"
 
 
-def test_compass_is_refused_in_words():
-    with pytest.raises(ConfigError, match="compass"):
-        plan(method="compass")
+def test_compass_imitates_then_specialises_by_residuals_then_distils():
+    stages = {stage.name: stage for stage in plan(method="compass", base_env_steps=5, root="model.pt")}
+    base, residual, distill = (stages[f"compass/{name}"] for name in ("base", "residual_g1", "distill"))
+    assert base.inputs == ("root",)
+    assert residual.inputs == ("compass/base",)
+    assert set(distill.inputs) == {"compass/base", *(f"compass/residual_{r}" for r in ExperimentCfg(name="x").robots)}
+    assert (base.init, residual.init, distill.init) == (None, None, "compass/base")
+    assert (base.demonstrations, residual.demonstrations, distill.demonstrations) == (True, False, True)
 
 
 def test_a_warm_task_has_whole_penalties_finishing_ranges_and_no_aids():

@@ -154,8 +154,14 @@ def test_a_damaged_input_is_refused_by_name(tmp_path):
 
 
 def test_a_missing_root_is_named(tmp_path):
-    with pytest.raises(CheckpointError, match=r"plan\.root"):
+    with pytest.raises(CheckpointError, match="nowhere"):
         run_experiment(toy_experiment(method="ppo", root="nowhere.pt"), tmp_path / "run", make_toy_env)
+
+
+def test_a_run_can_be_the_root(finished, tmp_path):
+    cfg = toy_experiment(iterations=1, judge_envs=0, method="ppo", root=str(finished.run_dir))
+    result = run_experiment(cfg, tmp_path / "run", make_toy_env)
+    assert result.records["root"].sha256 == finished.records["round1/distill"].sha256
 
 
 def test_the_run_is_complete_without_its_root(finished, tmp_path):

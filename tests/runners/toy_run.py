@@ -53,7 +53,8 @@ def make_toy_env(robots: Sequence[str], num_envs: int, task: TaskCfg, seed: int)
 def toy_experiment(iterations: int = 3, judge_envs: int = 4, **plan: object) -> ExperimentCfg:
     """Three robots, a few iterations a stage."""
     steps = ENVS * STEPS * iterations
-    budgets = {"generalist_env_steps": steps, "specialist_env_steps": steps, "distill_env_steps": steps}
+    keys = ("generalist_env_steps", "specialist_env_steps", "distill_env_steps", "base_env_steps")
+    budgets = dict.fromkeys(keys, steps)
     return ExperimentCfg(
         name="toy",
         robots=("one", "two", "three"),

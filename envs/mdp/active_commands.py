@@ -1,0 +1,79 @@
+"""The commands in force: sampled, or pinned from outside for evaluation and replay."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from eagle_rl.config.schema import GaitCfg
+
+from ..state import PooledState
+from .commands import CommandSampler
+from .gait import foot_phases
+
+
+class ActiveCommands:
+    """Each environment's command and how often it was drawn."""
+
+    def __init__(self, sampler: CommandSampler, interval_steps: int, dtype: torch.dtype) -> None:
+        """Start with zero commands; :meth:`draw` puts the first ones in force.
+
+        Args:
+            sampler: draws commands and judges how they were followed.
+            interval_steps: control steps between draws within an episode.
+            dtype: of the commands.
+        """
+        self.sampler = sampler
+        self._interval = interval_steps
+        robot_id = sampler.robot_id
+        self.count = torch.zeros_like(robot_id)
+        """How often each environment drew, shape (N,)."""
+        self.command = torch.zeros(len(robot_id), 5, dtype=dtype, device=robot_id.device)
+        """(v_x, v_y, omega, h, p), shape (N, 5)."""
+        self._pinned: Tensor | None = None
+
+    @property
+    def standing(self) -> Tensor:
+        """Whether all three velocity commands are zero, bool, shape (N,) (HugWBC 1)."""
+        return (self.command[:, :3] == 0).all(dim=1)
+
+    def pin(self, command: Tensor | None) -> None:
+        """Hold these commands, shape (N, 5), instead of sampling; ``None`` returns to sampling at the next draw."""
+        self._pinned = None if command is None else command.to(self.command, copy=True)
+        if self._pinned is not None:
+            self.command = self._pinned
+
+    def draw(self, ids: Tensor) -> None:
+        """Put the next commands of some environments in force, shape (n,)."""
+        if self._pinned is None:
+            command, _ = self.sampler.sample(ids, self.count[ids])
+            self.count[ids] += 1
+            self.command = self.command.index_copy(0, ids, command.to(self.command))
+
+    def judge(self, scores: tuple[Tensor, Tensor, Tensor, Tensor]) -> None:
+        """Credit one step to the windows of the sampled commands, see ``rewards.success_scores``."""
+        if self._pinned is None:
+            self.sampler.accumulate(*scores)
+
+    def due(self, episode_length: Tensor) -> Tensor:
+        """Environments whose command has been in force for its time, shape (n,)."""
+        return ((episode_length % self._interval == 0) & (episode_length > 0)).nonzero().squeeze(1)
+
+    def show(self, state: PooledState, phase: Tensor, gait: GaitCfg) -> None:
+        """Let a state, and so the next observation, show the commands now in force."""
+        state.command, state.standing = self.command, self.standing
+        state.foot_phase = foot_phases(phase, state.standing, gait)
+
+    def log(self) -> dict[str, float]:
+        """How far the curriculum has come."""
+        return self.sampler.log()
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Commands in force and the curriculum; not what is pinned."""
+        return {"command": self.command.clone(), "count": self.count.clone(), **self.sampler.state_dict()}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Restore what :meth:`state_dict` returned."""
+        self.command = state["command"].to(self.command)
+        self.count = state["count"].to(self.count, copy=True)
+        self.sampler.load_state_dict(state)

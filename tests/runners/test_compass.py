@@ -1,0 +1,114 @@
+"""COMPASS: who acts in which stage, and what is learned from it."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from eagle_rl.algorithms.specialists import SpecialistBank
+from eagle_rl.runners.checkpoint import load_actor
+from eagle_rl.runners.compass import (
+    DemonstrationEnv,
+    ResidualBank,
+    ResidualEnv,
+    ResidualPolicy,
+    begin_residual,
+    mean_actions,
+)
+from eagle_rl.runners.records import stage_dir
+from eagle_rl.runners.stages import run_experiment
+from tests.runners.toy_run import make_toy_env, toy_experiment
+from tests.toy import NUM_SLOTS
+
+ROBOTS = ("one", "two", "three")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    cfg = toy_experiment(iterations=2, judge_envs=2, method="compass")
+    return run_experiment(cfg, tmp_path_factory.mktemp("run"), make_toy_env)
+
+
+@pytest.fixture
+def actors(run):
+    """Demonstrator, base, and the residuals of the three robots."""
+
+    def load(stage: str):
+        return load_actor(run.run_dir / run.records[stage].checkpoint)[0]
+
+    return load("generalist"), load("compass/base"), [load(f"compass/residual_{robot}") for robot in ROBOTS]
+
+
+def make_env(seed: int = 3):
+    return make_toy_env(ROBOTS, 6, toy_experiment().task, seed)
+
+
+def test_all_three_stages_end_in_one_policy(run):
+    assert [name for name, record in run.records.items() if record.state == "done"] == [
+        "generalist",
+        "compass/base",
+        *(f"compass/residual_{robot}" for robot in ROBOTS),
+        "compass/distill",
+    ]
+    assert run.generalist.parent.parent == stage_dir(run.run_dir, "compass/distill")
+
+
+def test_the_base_policy_reads_a_prediction_of_the_next_frame(actors):
+    demonstrator, base, _ = actors
+    widths = [actor.architecture["observations"]["estimate"] for actor in (demonstrator, base)]
+    assert widths[1] - widths[0] == NUM_SLOTS, "one frame of the toy"
+
+
+def test_demonstrations_are_the_teachers_whatever_the_policy_does(actors):
+    shown = []
+    for actions in (torch.zeros(6, NUM_SLOTS), torch.ones(6, NUM_SLOTS)):
+        torch.manual_seed(0)
+        env = DemonstrationEnv(make_env(), SpecialistBank([actors[0]] * 3), NUM_SLOTS)
+        shown.append([env.step(actions)[0] for _ in range(20)])
+    assert all((a == b).all() for a, b in zip(*shown, strict=True))
+
+
+def test_the_target_of_the_world_model_is_the_frame_that_follows(actors):
+    env = DemonstrationEnv(make_env(), SpecialistBank([actors[0]] * 3), NUM_SLOTS)
+    for _ in range(40):
+        predicted = env.get_observations()["estimate"][:, -NUM_SLOTS:]
+        before = env.get_observations()["history"][:, :NUM_SLOTS]
+        obs, _, dones, _ = env.step(torch.zeros(6, NUM_SLOTS))
+        expected = torch.where(dones.unsqueeze(1), before, obs["history"][:, :NUM_SLOTS])
+        torch.testing.assert_close(predicted, expected)
+
+
+def test_a_fresh_residual_changes_nothing_and_explores_like_the_base(actors):
+    _, base, residuals = actors
+    begin_residual(residuals[0], base)
+    obs = make_env().get_observations()
+    assert torch.equal(ResidualPolicy(base, residuals[0])(obs), mean_actions(base, obs))
+    assert torch.equal(residuals[0].distribution.std_param, base.distribution.std_param)
+
+
+def test_the_residual_environment_executes_base_plus_residual(actors):
+    _, base, _ = actors
+    plain, wrapped = make_env(), ResidualEnv(make_env(), base)
+    residual = torch.randn(6, NUM_SLOTS, generator=torch.Generator().manual_seed(0))
+    for _ in range(5):
+        expected, _, _, _ = plain.step(mean_actions(base, plain.get_observations()) + residual)
+        assert (wrapped.step(residual)[0] == expected).all()
+
+
+def test_teachers_labels_are_the_actions_of_base_plus_residual(actors):
+    _, base, residuals = actors
+    obs = make_env().get_observations()
+    labels = ResidualBank(base, residuals).label(obs.unsqueeze(0))["teacher_action"][0]
+    for i, residual in enumerate(residuals):
+        rows = obs["robot"] == i
+        torch.testing.assert_close(labels[rows], ResidualPolicy(base, residual)(obs)[rows])
+
+
+def test_imitation_stages_learn_nothing_but_imitation(run):
+    metrics = (stage_dir(run.run_dir, "compass/distill") / "metrics.jsonl").read_text()
+    assert "Distill/kickstart_kl" in metrics
+    critics = [
+        torch.load(run.run_dir / run.records[stage].checkpoint, weights_only=True)["algorithm"]["critic_state_dict"]
+        for stage in ("compass/base", "compass/distill")
+    ]
+    assert all(torch.equal(critics[0][key], critics[1][key]) for key in critics[0]), "the critic has no part in it"
