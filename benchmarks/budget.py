@@ -22,20 +22,21 @@ class Budget:
         """Watch nothing."""
         self.wall: defaultdict[str, float] = defaultdict(float)
         self.cpu: defaultdict[str, float] = defaultdict(float)
-        self._watched: list[tuple[Any, str, str]] = []
+        self._watched: list[tuple[Any, str, str, bool]] = []
         self._originals: list[tuple[Any, str, Any]] = []
         self._stack: list[str] = []
+        self._whole = False
         self._last = (0.0, 0.0)
 
-    def watch(self, owner: Any, method: str, section: str) -> None:
-        """Book the time of a class's, module's or object's method under ``section``."""
-        self._watched.append((owner, method, section))
+    def watch(self, owner: Any, method: str, section: str, whole: bool = False) -> None:
+        """Book the time of a class's, module's or object's method under ``section``, ``whole`` with its callees."""
+        self._watched.append((owner, method, section, whole))
 
     def __enter__(self) -> Self:
         """Start; time outside of all watched methods is booked as ``other``."""
-        for owner, method, section in self._watched:
+        for owner, method, section, whole in self._watched:
             self._originals.append((owner, method, vars(owner).get(method)))
-            setattr(owner, method, self._timed(getattr(owner, method), section))
+            setattr(owner, method, self._timed(getattr(owner, method), section, whole))
         self._last = (time.perf_counter(), time.process_time())
         self._stack = ["other"]
         return self
@@ -60,15 +61,19 @@ class Budget:
         self.cpu[section] += now[1] - self._last[1]
         self._last = now
 
-    def _timed(self, function: Any, section: str) -> Any:
+    def _timed(self, function: Any, section: str, whole: bool) -> Any:
         @functools.wraps(function)
         def timed(*args: Any, **kwargs: Any) -> Any:
+            if self._whole:
+                return function(*args, **kwargs)
             self._book()
             self._stack.append(section)
+            self._whole = whole
             try:
                 return function(*args, **kwargs)
             finally:
                 self._book()
                 self._stack.pop()
+                self._whole = False
 
         return timed

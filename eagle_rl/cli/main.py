@@ -22,6 +22,7 @@ VERBS: dict[str, str] = {
     "sim2sim": "an exported policy in plain MuJoCo, without torch",
     "status": "progress of a run and its stages",
     "robots": "list, show or check robots",
+    "bench": "how fast this machine collects and learns",
     "doctor": "check this installation",
 }
 """Each verb ``v`` is ``eagle_rl.cli.v:main``."""

@@ -68,13 +68,13 @@ class RobotBatch:
         """
         wild = ~np.isfinite(targets.sum(axis=1))
         np.copyto(self.ctrl, targets, where=~wild[:, None])
-        warned = self._advance()
+        warned = self.advance()
         self._recorder.add(self._batch.state)
         self.causes = diagnose(self.qpos, self.qvel, self._time > self._last_time, warned, wild)
         self._last_time[:] = self._time
 
-    def _advance(self) -> NDArray[np.bool_]:
-        """Step; returns the simulations that MuJoCo warned about or refused to step, shape (n,)."""
+    def advance(self) -> NDArray[np.bool_]:
+        """Nothing but physics; returns the simulations that MuJoCo warned about or refused to step, shape (n,)."""
         refused = np.zeros(self.num_envs, dtype=np.bool_)
         try:
             self._batch.step(nstep=self._decimation, stage=_VEL)

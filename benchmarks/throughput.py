@@ -1,0 +1,141 @@
+"""Environment steps a second, against the physics alone, and the update against its matrix products."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from itertools import pairwise
+from statistics import median
+from typing import Any
+
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from eagle_rl.algorithms.eagle_ppo import EaglePPO
+from eagle_rl.runners.on_policy import EagleRunner
+
+from .budget import Budget
+from .measure import Figure, in_turns, milliseconds
+from .workloads import BarePhysics, Stepping, experiment, make_env, make_runner
+
+
+def environment(num_envs: int, threads: int, seconds: float, bar: str) -> list[Figure]:
+    """Rate of the whole environment step as a share of the bare physics' rate, as measured and as the CPU time says."""
+    env = make_env(experiment(threads), num_envs)
+    costs = in_turns({"step": Stepping(env).step, "bare": BarePhysics(env).step}, seconds)
+    step, bare = costs["step"], costs["bare"]
+    name = f"environment step / bare physics, {num_envs} envs"
+    detail = milliseconds(step=step.wall, bare=bare.wall)
+    ideal = bare.cpu / threads
+    overhead = max(0.0, step.cpu - bare.cpu)
+    cpu_detail = milliseconds(cpu_step=step.cpu, cpu_bare=bare.cpu) + f", {1e6 * overhead / num_envs:.1f} us an env"
+    return [
+        Figure(name, bare.wall / step.wall, "x", bar, detail),
+        Figure(f"{name}, from CPU time", ideal / (ideal + overhead), "x", bar, cpu_detail),
+    ]
+
+
+def pooling(num_envs: int, threads: int, seconds: float) -> list[Figure]:
+    """Five robots pooled against one robot at a time with as many environments, each weighted by its physics."""
+    cfg = experiment(threads)
+    actions: dict[str, Callable[[], object]] = {}
+    for name in (*cfg.robots, "pool"):
+        env = make_env(cfg, num_envs, None if name == "pool" else (name,))
+        actions[name] = Stepping(env).step
+        actions[f"{name} bare"] = BarePhysics(env).step
+    costs = in_turns(actions, seconds, warm_up=2)
+
+    def overhead(name: str) -> float:
+        return costs[name].cpu - costs[f"{name} bare"].cpu
+
+    alone = sum(overhead(name) for name in cfg.robots) / len(cfg.robots)
+    physics = costs["pool bare"].cpu / threads
+    ratio = (physics + alone) / (physics + overhead("pool"))
+    detail = milliseconds(pool_overhead=overhead("pool"), mean_overhead_alone=alone, physics=physics)
+    return [Figure("five robots pooled / one robot, same physics", ratio, "x", ">= 0.95", detail)]
+
+
+def scaling(num_envs: int, seconds: float) -> list[Figure]:
+    """The environment step with two physics threads against one."""
+    steps = {str(threads): Stepping(make_env(experiment(threads), num_envs)).step for threads in (1, 2)}
+    costs = in_turns(steps, seconds)
+    one, two = costs["1"].wall, costs["2"].wall
+    return [Figure("environment step, 2 threads / 1 thread", one / two, "x", ">= 1.7", milliseconds(one=one, two=two))]
+
+
+class _Products(TorchDispatchMode):
+    """Counts the matrix products that are computed, by their shapes (rows, inner, columns)."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.shapes: Counter[tuple[int, int, int]] = Counter()
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if func in (torch.ops.aten.mm.default, torch.ops.aten.addmm.default):
+            a, b = args[-2:]
+            self.shapes[(a.shape[0], a.shape[1], b.shape[1])] += 1
+        return func(*args, **(kwargs or {}))
+
+
+class _Multiplying:
+    """The matrix products of an update, and nothing else."""
+
+    def __init__(self, shapes: Counter[tuple[int, int, int]]) -> None:
+        self._work = [(torch.randn(m, k), torch.randn(k, n), count) for (m, k, n), count in shapes.items()]
+        self.flops = sum(2.0 * m * k * n * count for (m, k, n), count in shapes.items())
+
+    def multiply(self) -> None:
+        for a, b, count in self._work:
+            for _ in range(count):
+                torch.mm(a, b)
+
+
+def _products_of_update(runner: EagleRunner) -> _Multiplying:
+    """Train for an iteration and see what its update multiplies."""
+    counted, update = _Products(), runner.alg.update
+
+    def counting() -> dict[str, float]:
+        with counted:
+            return update()
+
+    runner.alg.update = counting  # type: ignore[method-assign]
+    runner.learn(1)
+    del runner.alg.update
+    return _Multiplying(counted.shapes)
+
+
+def iteration(num_envs: int, threads: int, iterations: int) -> list[Figure]:
+    """Whole iterations, in turns with the bare physics and the bare matrix products of as much work."""
+    cfg = experiment(threads)
+    env = make_env(cfg, num_envs)
+    runner, bare = make_runner(cfg, env), BarePhysics(env)
+    products = _products_of_update(runner)
+    budget, books = Budget(), []
+    for owner, method, section in ((EaglePPO, "update", "update"), (bare, "step", "bare")):
+        budget.watch(owner, method, section, whole=True)
+    budget.watch(products, "multiply", "products")
+
+    def turn(_: int) -> None:
+        for _ in range(cfg.algo.num_steps_per_env):
+            bare.step()
+        products.multiply()
+        books.append(dict(budget.wall))
+
+    with budget:
+        runner.learn(iterations + 1, on_iteration=turn)
+    rounds = [{name: after[name] - before[name] for name in after} for before, after in pairwise(books)]
+    times = {name: median(r[name] for r in rounds) for name in ("other", "update", "bare", "products")}
+    return _iteration_figures(num_envs, cfg.algo.num_steps_per_env * num_envs, times, products.flops)
+
+
+def _iteration_figures(num_envs: int, env_steps: int, times: dict[str, float], flops: float) -> list[Figure]:
+    collection, update, bare, products = (times[name] for name in ("other", "update", "bare", "products"))
+    whole = collection + update
+    detail = milliseconds(collection=collection, update=update, bare=bare)
+    rate = f"{flops / products / 1e9:.0f} GFLOP/s alone, {flops / env_steps / 1e6:.1f} MFLOP an env-step"
+    return [
+        Figure(f"collection / bare physics, {num_envs} envs", bare / collection, "x", ">= 0.70", detail),
+        Figure("whole iteration / bare physics", bare / whole, "x", ">= 0.35", f"{env_steps / whole:.0f} env-steps/s"),
+        Figure("update's share of the iteration", update / whole, "share", "<= 0.50", ""),
+        Figure("matrix products' share of the update", products / update, "share", ">= 0.80", rate),
+    ]

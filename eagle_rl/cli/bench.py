@@ -1,0 +1,124 @@
+"""``eagle bench``: how fast this machine collects and learns, as ratios to what it could do at best."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from eagle_rl.errors import EagleError, did_you_mean
+from eagle_rl.paths import data_root
+from eagle_rl.runners.provenance import versions
+
+if TYPE_CHECKING:
+    from benchmarks.measure import Figure
+
+PARTS: dict[str, str] = {
+    "environment": "the environment step against bare physics, at 512 and 64 environments",
+    "pooling": "five robots pooled against one robot at a time",
+    "scaling": "two physics threads against one",
+    "iteration": "collection, update and whole iterations against bare physics and bare matrix products",
+    "resources": "memory and start-up of 4096 environments, --help, first iteration",
+    "profile": "where the time of an iteration goes",
+    "processes": "one process against a process a core, in whole runs",
+}
+DEFAULT = ("environment", "pooling", "scaling", "iteration", "resources")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="eagle bench",
+        description="Measure speed and memory. Both sides of a ratio are measured in turns in one process, so that "
+        "other work on the machine slows both; still, leave it alone for numbers worth keeping.",
+        epilog="Parts: " + "; ".join(f"{name}: {what}" for name, what in PARTS.items()) + ".",
+    )
+    parser.add_argument("parts", nargs="*", metavar="PART", help=f"what to measure [{' '.join(DEFAULT)}]")
+    parser.add_argument("--envs", type=int, default=512, metavar="N", help="environments over all robots [512]")
+    parser.add_argument("--threads", type=int, metavar="N", help="physics threads [one a core]")
+    parser.add_argument("--seconds", type=float, default=10.0, metavar="S", help="time for each ratio [10]")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures into FILE too")
+    return parser
+
+
+def _import_benchmarks() -> None:
+    """Make the ``benchmarks`` folder of a checkout importable."""
+    root = data_root()
+    if not (root / "benchmarks").is_dir():
+        raise EagleError(
+            "eagle bench: the measurements are part of the source tree and are not installed. "
+            "Clone the repository and run `make bench` there."
+        )
+    if str(root) not in sys.path:
+        sys.path.insert(0, str(root))
+
+
+def _measure(part: str, envs: int, threads: int, seconds: float) -> list[Figure]:
+    from benchmarks import resources, throughput
+    from benchmarks.processes import processes
+    from benchmarks.profile import profile
+
+    def environment() -> list[Figure]:
+        small = throughput.environment(64, threads, seconds / 2, ">= 0.80")
+        return throughput.environment(envs, threads, seconds, ">= 0.90") + small
+
+    measurements: dict[str, Callable[[], list[Figure]]] = {
+        "environment": environment,
+        "pooling": lambda: throughput.pooling(envs, threads, seconds),
+        "scaling": lambda: throughput.scaling(envs, seconds),
+        "iteration": lambda: throughput.iteration(envs, threads, max(3, round(seconds / 2))),
+        "resources": lambda: resources.large() + resources.answers() + resources.first_iteration(),
+        "profile": lambda: profile(envs, threads),
+        "processes": lambda: processes(envs, threads),
+    }
+    return measurements[part]()
+
+
+def _machine(envs: int, threads: int) -> dict[str, str]:
+    """What the figures depend on."""
+    cpuinfo = Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
+    names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
+    return {
+        "processor": names[0] if names else platform.processor(),
+        "cores": str(os.cpu_count()),
+        "physics threads": str(threads),
+        "envs": str(envs),
+        "load": " ".join(f"{load:.1f}" for load in os.getloadavg()),
+    } | versions()
+
+
+def _table(machine: dict[str, str], figures: Sequence[Figure]) -> str:
+    """Machine and figures in Markdown."""
+    about = ", ".join(f"{name} {value}" for name, value in machine.items())
+    rows = [f"| {f.name} | {_shown(f)} | {f.bar} | {f.detail} |" for f in figures]
+    return "\n".join([about, "", "| figure | measured | bar | medians |", "|---|---|---|---|", *rows])
+
+
+def _shown(figure: Figure) -> str:
+    return f"{figure.value:.1%}" if figure.unit == "share" else f"{figure.value:.2f} {figure.unit}"
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run ``eagle bench``."""
+    args = _parser().parse_args(argv)
+    parts = args.parts or DEFAULT
+    for part in parts:
+        if part not in PARTS:
+            raise EagleError(f"eagle bench: no part {part!r}.{did_you_mean(part, PARTS)} Known: {', '.join(PARTS)}.")
+    threads = args.threads or len(os.sched_getaffinity(0))
+    _import_benchmarks()
+    machine = _machine(args.envs, threads)
+    figures: list[Figure] = []
+    for part in parts:
+        print(f"measuring: {PARTS[part]}", file=sys.stderr)
+        figures += _measure(part, args.envs, threads, args.seconds)
+    print(_table(machine, figures))
+    if args.json is not None:
+        args.json.write_text(json.dumps({"machine": machine, "figures": [asdict(f) for f in figures]}, indent=1))
+    return 0
