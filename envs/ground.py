@@ -86,6 +86,7 @@ class Surface:
         self._rows, self._columns = field.heights.shape
         self._cell = field.cell_size
         self._heights = like.new_tensor(field.heights).flatten()
+        self._last_corner = like.new_tensor([self._columns - 2, self._rows - 2])
         self.extent = like.new_tensor([self._columns - 1, self._rows - 1]) * (0.5 * field.cell_size)
         """Distance of the edges from the origin along x and y [m], shape (2,)."""
 
@@ -96,7 +97,7 @@ class Surface:
         """
         place = torch.maximum(torch.minimum(xy, self.extent), -self.extent) + self.extent
         place = place / self._cell
-        corner = torch.minimum(place.floor(), place.new_tensor([self._columns - 2, self._rows - 2]))
+        corner = torch.minimum(place.floor(), self._last_corner)
         x, y = (place - corner).unbind(-1)
         column, row = corner.long().unbind(-1)
         first = row * self._columns + column
@@ -131,6 +132,7 @@ class UnevenGround(Plane):
         """
         super().__init__(scan_points)
         self._surface = Surface(terrain.field, scan_points)
+        self._scan_offsets = torch.nn.functional.pad(scan_points, (0, 1))
         self._centres = scan_points.new_tensor(terrain.centres)
         self._robot_id, self._rng = robot_id, rng
         self._step_dt, self._episode_steps = step_dt, episode_steps
@@ -148,8 +150,8 @@ class UnevenGround(Plane):
     def measure(self, root_pos: Tensor, root_quat: Tensor, foot_pos: Tensor) -> dict[str, Tensor]:
         """Heights over the ground under root and soles, and of the ground around relative to that under the root."""
         root = root_pos.unsqueeze(1)
-        ahead = torch.nn.functional.pad(self._scan_points, (0, 1)).expand(len(root), -1, 3)
-        around = root + from_yaw_frame(heading_of(root_quat).unsqueeze(1), ahead)
+        ahead = from_yaw_frame(heading_of(root_quat).unsqueeze(1), self._scan_offsets.expand(len(root), -1, 3))
+        around = root + ahead
         ground = self._surface.height(torch.cat((root, foot_pos, around), dim=1)[..., :2])
         return {
             "base_height": root_pos[:, 2] - ground[:, 0],
