@@ -20,8 +20,8 @@ from .mdp.aids import LearningAids, harness_damping, harness_wrench
 from .mdp.commands import CommandSampler
 from .mdp.curriculum import penalty_scale
 from .mdp.gait import advance_phase, clock, foot_phases
-from .mdp.metrics import contact_match, measured_commands, tracking_errors
 from .mdp.layout import SENSED_SIZE
+from .mdp.metrics import contact_match, measured_commands, tracking_errors
 from .mdp.observations import (
     History,
     ObservationLayout,
