@@ -58,8 +58,8 @@ class Plane:
         Args:
             ids: environments, shape (n,).
             count: episodes each began, shape (n,).
-            state: at the end of the episode, n rows.
-            length: age of the episode in control steps, shape (n,).
+            state: of all environments, at the end of the episode.
+            length: age of all episodes in control steps, shape (N,).
         """
 
     def left(self, root_pos: Tensor) -> Tensor:
@@ -183,10 +183,10 @@ class UnevenGround(Plane):
         steps, (score, asked, walked) = self._steps[ids], self._sums[ids].unbind(1)
         duration = steps.clamp(min=1)
         asked_in_full = asked / duration * self._episode_steps
-        upright = state.projected_gravity_b[:, 2] < -UPRIGHT
+        upright = state.projected_gravity_b[ids, 2] < -UPRIGHT
         up = (walked > self._half_patch) & (score / duration > MIN_SCORE) & upright
-        down = ~up & (walked < MIN_PROGRESS * asked_in_full) & ~self.left(state.root_pos_w)
-        judged = (count > 0) & (steps == length)
+        down = ~up & (walked < MIN_PROGRESS * asked_in_full) & ~self.left(state.root_pos_w[ids])
+        judged = (count > 0) & (steps == length[ids])
         level = self.level[ids]
         moved = (level + up.long() - down.long()).clamp(min=0)
         anywhere = self._draw("terrain_level", len(self._centres), count, ids)

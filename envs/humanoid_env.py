@@ -20,6 +20,7 @@ from .mdp.aids import LearningAids, harness_damping, harness_wrench
 from .mdp.commands import CommandSampler
 from .mdp.curriculum import penalty_scale
 from .mdp.gait import advance_phase, clock, foot_phases
+from .mdp.layout import SENSED_SIZE
 from .mdp.metrics import contact_match, measured_commands, tracking_errors
 from .mdp.observations import (
     History,
@@ -118,6 +119,7 @@ class HumanoidEnv(VecEnv):
         )
         self.layout = ObservationLayout(observations)
         self.mirror = self.layout.mirror(self.device)
+        self._live = self.robots.slot_mask > 0
         self._noise = noise_scale(observations, self.robots)
         self.step_log = StepLog(self.robot_names, robot_id)
         self._all = torch.arange(num_envs, device=self.device)
@@ -237,7 +239,7 @@ class HumanoidEnv(VecEnv):
 
     def _act(self, actions: Tensor) -> Tensor:
         """Remember the actions and turn them into canonical PD targets [rad], (N, 32); NaN where one is absurd."""
-        clip, live = self.task.control.action_clip, self.robots.slot_mask > 0
+        clip, live = self.task.control.action_clip, self._live
         sound = actions.abs() <= MAX_ACTION
         self._last_last_actions, self._last_actions = self._last_actions, self._actions
         self._actions = torch.where(live & sound, actions.to(self._actions.dtype).clamp(-clip, clip), 0.0)
@@ -262,7 +264,7 @@ class HumanoidEnv(VecEnv):
 
     def _derive(self) -> PooledState:
         """Turn the staging rows into the pooled state, with the command, phase and actions now in force."""
-        physical = measured(self._staged, self.pool.columns)
+        physical, standing = measured(self._staged, self.pool.columns), self.commands.standing
         return PooledState(
             **physical,
             **self.ground.measure(physical["root_pos_w"], physical["root_quat_w"], physical["foot_pos_w"]),
@@ -270,8 +272,8 @@ class HumanoidEnv(VecEnv):
             last_foot_contact=self._last_contact,
             friction=self.randomizer.friction,
             command=self.command,
-            standing=self.commands.standing,
-            foot_phase=foot_phases(self.phase, self.commands.standing, self.task.gait),
+            standing=standing,
+            foot_phase=foot_phases(self.phase, standing, self.task.gait),
             actions=self._actions,
             last_actions=self._last_actions,
             last_last_actions=self._last_last_actions,
@@ -293,19 +295,18 @@ class HumanoidEnv(VecEnv):
 
     def _observe(self) -> None:
         """Push the frame of the present state, delayed and corrupted, into the history."""
-        cfg = self.task.observations
-        frame = proprioception(self.state, self.robots, cfg)
+        frame = proprioception(self.state, self.robots, self.task.observations)
         sensed = delay(frame, self._last_frame, self.randomizer.latency)
-        if cfg.enable_corruption:
-            noise = self.rng.uniform("observation_noise", self.common_step_counter, frame.shape[1])
-            sensed = sensed + (2.0 * noise - 1.0).to(frame.dtype) * self._noise
+        if self.task.observations.enable_corruption:
+            u = self.rng.uniform_in(-1.0, 1.0, "observation_noise", self.common_step_counter, SENSED_SIZE)
+            sensed[:, :SENSED_SIZE].addcmul_(u.to(frame.dtype), self._noise[:, :SENSED_SIZE])
         self._last_frame = frame
         self.history.push(sensed)
 
     def _reset(self, ids: Tensor) -> None:
         """Start new episodes; other environments are untouched, bit for bit."""
         count = self.episode_count[ids]
-        self.ground.advance(ids, count, self.state.rows(ids), self.episode_length_buf[ids])
+        self.ground.advance(ids, count, self.state, self.episode_length_buf)
         self.randomizer.reset(ids, count, self.step_dt)
         root, joint_pos, joint_vel = self.randomizer.initial_state(ids, count)
         staged = self.pool.reset(ids, self.ground.place(ids, count, root), joint_pos, joint_vel)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import Any
 
 import torch
@@ -58,7 +59,6 @@ class StepLog:
             dones: episodes that ended, bool, shape (N,).
             standing: whether the command is to stand, bool, shape (N,).
         """
-        moving = (~standing).to(contact_match.dtype)
         self._columns = [
             *(f"Episode_Reward/{name}" for name in terms),
             *(f"Episode_Termination/{name}" for name in reasons),
@@ -66,16 +66,14 @@ class StepLog:
             *(f"Metrics/{name}" for name in ERROR_NAMES),
             *("match", "moving", "falls", "dones"),
         ]
-        rows = torch.stack(
-            [
-                *terms.values(),
-                *(reason.to(errors.dtype) for reason in reasons.values()),
-                *(causes.unsqueeze(1) == self._cause_codes).to(errors.dtype).unbind(1),
-                *errors.unbind(1),
-                *(contact_match * moving, moving, falls.to(errors.dtype), dones.to(errors.dtype)),
-            ],
-            dim=1,
-        ).double()
+        blocks = (
+            torch.stack(list(terms.values()), dim=1) if terms else errors[:, :0],
+            torch.stack(list(reasons.values()), dim=1),
+            causes.unsqueeze(1) == self._cause_codes,
+            errors,
+            torch.stack((contact_match.masked_fill(standing, 0.0), ~standing, falls, dones), dim=1),
+        )
+        rows = torch.cat(blocks, dim=1).double()
         if self._sums is None:
             self._sums = rows.new_zeros(len(self._names), rows.shape[1])
         self._sums = self._sums.index_add(0, self._robot_id, rows)
@@ -88,29 +86,30 @@ class StepLog:
         of sickness are counted, and ``Health/sick_share`` is their sum as a share of the environment steps.
         """
         assert self._sums is not None, "flush follows add"
-        sums, column = self._sums, {name: i for i, name in enumerate(self._columns)}
+        sums = self._sums
+        counts = Counter(tag.partition("/")[0] for tag in self._columns[:-4])
+        kinds = ("Episode_Reward", "Episode_Termination", "Health", "Metrics")
+        rewards, terminations, causes, errors, last = sums.split([*(counts[kind] for kind in kinds), 4], dim=1)
+        match, moving, falls, dones = last.split(1, dim=1)
         env_steps = self._num_envs * self._steps
-        means = sums / env_steps
-        match = sums[:, column["match"]] / sums[:, column["moving"]].clamp(min=1.0)
-        dones = sums[:, column["dones"]]
-        falls_per_step = means[:, column["falls"]]
-        sick_share = means[:, [i for tag, i in column.items() if tag.startswith("Health/")]].sum(dim=1)
-        entry: dict[str, Tensor] = {}
-        for robot, name in enumerate(self._names):
-            for tag, i in column.items():
-                if tag.startswith("Metrics/"):
-                    entry[f"{tag}/{name}"] = means[robot, i]
-                elif tag.startswith("Episode_Reward/"):
-                    entry[f"{tag}/{name}"] = means[robot, i] * 50.0
-                elif tag.startswith("Episode_Termination/"):
-                    entry[f"{tag}/{name}"] = sums[robot, i] / dones[robot].clamp(min=1.0)
-                elif tag.startswith("Health/"):
-                    entry[f"{tag}/{name}"] = sums[robot, i]
-            entry[f"Health/sick_share/{name}"] = sick_share[robot]
-            entry[f"Metrics/contact_match/{name}"] = match[robot]
-            entry[f"Metrics/falls_per_1000_steps/{name}"] = falls_per_step[robot] * 1000.0
+        match, falls_per_step = match / moving.clamp(min=1.0), falls / env_steps
+        table = torch.cat(
+            (
+                rewards / env_steps * 50.0,
+                terminations / dones.clamp(min=1.0),
+                causes,
+                errors / env_steps,
+                causes.sum(dim=1, keepdim=True) / env_steps,
+                match,
+                falls_per_step * 1000.0,
+            ),
+            dim=1,
+        )
+        columns = (*self._columns[:-4], "Health/sick_share", "Metrics/contact_match", "Metrics/falls_per_1000_steps")
+        tags = [f"{column}/{name}" for name in self._names for column in columns]
         self._sums, self._steps = torch.zeros_like(sums), 0
-        return entry, falls_per_step, match
+        entry = dict(zip(tags, table.float().flatten().unbind(), strict=True))
+        return entry, falls_per_step.squeeze(1), match.squeeze(1)
 
     def state_dict(self) -> dict[str, Any]:
         """The sums of the unfinished interval."""

@@ -23,6 +23,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from eagle_rl.algorithms.auxiliary import AuxiliaryLosses, Distill, Estimation, Kickstart, Mirror
+from eagle_rl.algorithms.rollout import Rollout
 from eagle_rl.algorithms.specialists import SpecialistBank
 from eagle_rl.config.schema import AlgoCfg
 from eagle_rl.errors import HealthError
@@ -86,6 +87,7 @@ class EaglePPO(PPO):
     def construct_algorithm(obs: TensorDict, env: VecEnv, cfg: dict[str, Any], device: str) -> EaglePPO:
         """Build models, storage and algorithm for an environment with ``robot_names`` and a ``mirror`` map."""
         alg: EaglePPO = PPO.construct_algorithm(obs, env, cfg, device)
+        alg.storage = Rollout("rl", env.num_envs, cfg["num_steps_per_env"], obs, [env.num_actions], device)
         alg.robot_names = list(env.robot_names)
         if alg.cfg.estimation_coef > 0:
             alg.symmetry.terms.append(Estimation(alg.cfg.estimation_coef))

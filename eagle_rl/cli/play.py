@@ -31,7 +31,7 @@ def _parser() -> argparse.ArgumentParser:
         epilog="Example: python play.py logs/quickstart/RUN --robots h1,g1 --video two.mp4",
     )
     parser.add_argument(
-        "checkpoint", nargs="?", type=Path, metavar="CKPT", help="checkpoint, stage or run [newest run in logs/]"
+        "checkpoint", nargs="?", type=Path, metavar="CKPT", help="checkpoint, stage or run [the published policy, or the newest run in logs/]"
     )
     parser.add_argument("--robots", metavar="A,B|all", help="robots to show [those it was trained on]")
     parser.add_argument(
@@ -58,6 +58,10 @@ def has_display() -> bool:
     if sys.platform != "linux":
         return True
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+PUBLISHED = Path("checkpoints") / "generalist.safetensors"
+"""The policy that comes with the repository."""
 
 
 def newest_run(logs: Path = Path("logs")) -> Path:
@@ -119,7 +123,7 @@ def main(argv: Sequence[str]) -> int:
 
     from eagle_rl.runners.locate import find_checkpoint
 
-    checkpoint = find_checkpoint(args.checkpoint or newest_run())
+    checkpoint = find_checkpoint(args.checkpoint or (PUBLISHED if PUBLISHED.is_file() else newest_run()))
     if viewer == "none":
         seconds = args.seconds or script.duration
         video = args.video if files else checkpoint.with_suffix(".mp4")

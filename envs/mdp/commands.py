@@ -77,6 +77,12 @@ class CommandSampler:
         self.robot_id = robots.robot_id
         self._rng = rng
         self._grid = CommandGrid(cfg, robots.robot_id.device)
+        others = (cfg.lin_vel_y, cfg.base_height, cfg.body_pitch)
+        self._initial, self._finishing = (
+            torch.stack([_corner(ranges, side, robots.robot_id.device) for side in (0, 1)])
+            for ranges in ([r.initial for r in others], [r.finishing for r in others])
+        )
+        self._thresholds = torch.tensor(_thresholds(cfg.curriculum), dtype=torch.float64, device=robots.robot_id.device)
         self._window_steps = max(1, round(cfg.resampling_time_s / step_dt))
         device, num_envs = robots.robot_id.device, robots.robot_id.shape[0]
         start = self._grid.initial if cfg.curriculum.enabled else torch.ones_like(self._grid.initial)
@@ -117,22 +123,17 @@ class CommandSampler:
         return command.to(torch.float32), (command[:, :3] == 0.0).all(dim=1)
 
     def _draw(self, robot: Tensor, draws: Tensor) -> tuple[Tensor, Tensor]:
-        """Uniform numbers (n, 7) to raw commands (n, 5) and grid bins (n,)."""
+        """Uniform numbers (n, 7) to raw commands (n, 5) and grid bins (n,).
+
+        v_y, height and pitch come from their initial ranges until a robot's grid is complete, then the finishing ones.
+        """
         cumulative = self.weights.cumsum(dim=1)[robot]
         bins = (cumulative <= draws[:, :1] * cumulative[:, -1:]).sum(dim=1)
         planar = self._grid.lower[bins] + draws[:, 1:3] * self._grid.width
         complete = (self.weights > 0.0).all(dim=1)[robot]
-        lin_vel_y, height, pitch = (
-            self._switched(ranges.initial, ranges.finishing, complete, draws[:, column])
-            for column, ranges in enumerate((self.cfg.lin_vel_y, self.cfg.base_height, self.cfg.body_pitch), start=3)
-        )
-        return torch.stack((planar[:, 0], lin_vel_y, planar[:, 1], height, pitch), dim=1), bins
-
-    @staticmethod
-    def _switched(initial: Range, finishing: Range, complete: Tensor, draw: Tensor) -> Tensor:
-        """Uniform in the initial range until a robot's grid is complete, then in the finishing one."""
-        first = initial[0] + (initial[1] - initial[0]) * draw
-        return torch.where(complete, finishing[0] + (finishing[1] - finishing[0]) * draw, first)
+        low, high = torch.where(complete.view(-1, 1, 1), self._finishing, self._initial).unbind(1)
+        others = torch.lerp(low, high, draws[:, 3:6])
+        return torch.cat((planar[:, :1], others[:, :1], planar[:, 1:], others[:, 1:]), dim=1), bins
 
     def _zero_small(self, command: Tensor, stands: Tensor) -> tuple[Tensor, Tensor]:
         """Apply the dead zone and the standing share; also returns whether any velocity was zeroed, shape (n,)."""
@@ -148,7 +149,7 @@ class CommandSampler:
         """
         curriculum = self.cfg.curriculum
         mean = self._sums[ids] / self._window_steps
-        success = (mean > mean.new_tensor(_thresholds(curriculum))).all(dim=1) & self._creditable[ids]
+        success = (mean > self._thresholds).all(dim=1) & self._creditable[ids]
         winners = ids[success]
         if winners.numel() == 0:
             return

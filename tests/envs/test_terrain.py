@@ -250,7 +250,7 @@ def test_only_environments_that_end_change_level() -> None:
     on = ground()
     on.level = torch.full((4,), 1)
     state, ids = episode(on, 0.1), torch.tensor([1, 3])
-    on.advance(ids, torch.ones(2, dtype=torch.long), state.rows(ids), torch.full((2,), 100))
+    on.advance(ids, torch.ones(2, dtype=torch.long), state, torch.full((4,), 100))
     assert on.level.tolist() == [1, 0, 1, 0]
     state = episode(on, 0.1, steps=1)
     on.advance(IDS, torch.ones(4, dtype=torch.long), state, torch.tensor([101, 1, 101, 1]))
