@@ -4,6 +4,7 @@
 #   make play      the published policy, or CKPT=PATH, on five robots side by side
 #   make test      all tests            make check     format, lint, types
 #   make bench     throughput           make package   sdist and wheel, installed and tried in an empty folder
+#   make mutants   break the mathematics in 55 places, one at a time: do the tests notice? (about ten minutes)
 #   make clean     remove what was built (never logs/)
 #
 # PYTHON names the interpreter (3.10 to 3.13). CONSTRAINTS= installs the newest allowed packages instead of the tested
@@ -19,7 +20,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 INSTALLED := $(VENV)/.installed
 
-.PHONY: setup train play test check bench package clean help
+.PHONY: setup train play test check bench mutants package clean help
 
 help:
 	@sed -n 's/^# \{0,1\}//p' Makefile
@@ -49,6 +50,9 @@ check: $(INSTALLED)
 
 bench: $(INSTALLED)
 	$(BIN)/eagle bench
+
+mutants: $(INSTALLED)
+	$(BIN)/python -m tests.mutants
 
 package: $(INSTALLED)
 	rm -rf dist build
