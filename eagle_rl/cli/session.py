@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from eagle_rl.config.schema import ExperimentCfg, TerrainCfg
+from eagle_rl.config.schema import ExperimentCfg
 from eagle_rl.evaluation.protocol import evaluation_task
 from envs.humanoid_env import HumanoidEnv
 from envs.robots.load import load_robot
@@ -38,7 +38,7 @@ class Session:
         self.cfg = cfg
         self.specs = [load_robot(name) for name in robots]
         protocol = dataclasses.replace(cfg.evaluation, num_steps=num_steps, randomization=False, noise=False)
-        task = dataclasses.replace(evaluation_task(cfg.task, protocol), terrain=TerrainCfg())
+        task = evaluation_task(cfg.task, protocol)
         self._env = HumanoidEnv(task, self.specs, len(self.specs), protocol.seed, num_threads=1)
         self._actor = actor
         self.step_dt = self._env.step_dt

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from eagle_rl.config.schema import CommandsCfg, EvaluationCfg, TaskCfg
+from eagle_rl.config.schema import CommandsCfg, EvaluationCfg, TaskCfg, TerrainCfg
 
 COMMANDS = ("lin_vel_x", "lin_vel_y", "ang_vel_z", "base_height", "body_pitch")
 """Names of the five commands in their order in every (..., 5) tensor."""
@@ -27,7 +27,7 @@ def step_dt(task: TaskCfg) -> float:
 
 
 def evaluation_task(task: TaskCfg, ev: EvaluationCfg) -> TaskCfg:
-    """The task a policy is judged in: no curriculum, no aids, no time-out before the last step.
+    """The task a policy is judged in: flat ground, no curriculum, no aids, no time-out before the last step.
 
     Sensor noise and randomized dynamics are off unless ``ev`` asks for them; pushes are then at full strength.
     """
@@ -35,6 +35,7 @@ def evaluation_task(task: TaskCfg, ev: EvaluationCfg) -> TaskCfg:
     return replace(
         task,
         sim=replace(task.sim, physics_dt=ev.physics_dt, decimation=ev.decimation),
+        terrain=TerrainCfg(),
         commands=replace(task.commands, curriculum=replace(task.commands.curriculum, enabled=False)),
         observations=replace(task.observations, enable_corruption=ev.noise),
         rewards=replace(task.rewards, penalty_initial=1.0),

@@ -8,8 +8,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eagle_rl.config.schema import CommandsCfg, EvaluationCfg
-from eagle_rl.evaluation.protocol import COMMANDS, draw_commands, varied_commands
+from eagle_rl.config.schema import CommandsCfg, EvaluationCfg, TaskCfg, TerrainCfg
+from eagle_rl.evaluation.protocol import COMMANDS, draw_commands, evaluation_task, varied_commands
 
 CFG = CommandsCfg()
 EV = EvaluationCfg(num_steps=400, resampling_time_s=4.0)
@@ -42,3 +42,13 @@ def test_robots_and_seeds_draw_different_commands():
         draw_commands(CFG, dataclasses.replace(EV, seed=seed), robot, 4) for seed in (1, 2) for robot in ("h1", "g1")
     ]
     assert len({tuple(d.flatten().tolist()) for d in drawn}) == 4
+
+
+def test_policies_are_judged_on_flat_ground_without_help_or_disturbance():
+    trained = TaskCfg(terrain=TerrainCfg(kind="steps"))
+    task = evaluation_task(trained, EV)
+    assert task.terrain.kind == "plane"
+    assert not (task.randomization.enabled or task.observations.enable_corruption)
+    assert task.aids.harness == task.aids.gait_shaping == 0.0
+    assert task.terminations.episode_length_s > EV.num_steps * 0.02
+    assert task.rewards.weights == trained.rewards.weights
