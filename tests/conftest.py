@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import socket
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+
+os.environ["OMP_NUM_THREADS"] = "1"  # before torch: processes that tests start compute with one thread, too
 
 import pytest
 import torch
@@ -13,7 +17,21 @@ from hypothesis import Phase, settings
 phases = [Phase.explicit, Phase.generate, Phase.shrink]
 settings.register_profile("eagle", derandomize=True, deadline=None, database=None, print_blob=False, phases=phases)
 settings.load_profile("eagle")
-torch.set_num_threads(1)
+
+
+def plain_torch() -> None:
+    """Set back what ``set_up_torch`` sets for a whole process."""
+    torch.set_num_threads(1)
+    if hasattr(torch.backends.mkldnn, "matmul"):  # torch 2.9 and later
+        torch.backends.mkldnn.matmul.fp32_precision = "none"
+
+
+@pytest.fixture(autouse=True)
+def same_arithmetic() -> Iterator[None]:
+    """Start every test with the same arithmetic, whatever a test before it has set."""
+    plain_torch()
+    yield
+    plain_torch()
 
 
 @pytest.fixture(autouse=True)

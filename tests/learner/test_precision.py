@@ -1,20 +1,9 @@
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import pytest
 import torch
 
 from eagle_rl.models import precision
-
-
-@pytest.fixture(autouse=True)
-def restore() -> Iterator[None]:
-    threads, matmul = torch.get_num_threads(), torch.backends.mkldnn.matmul
-    before = matmul.fp32_precision
-    yield
-    matmul.fp32_precision = before
-    torch.set_num_threads(threads)
 
 
 @pytest.mark.parametrize("shape", [(1920, 510, 256), (64, 174, 256), (1, 33, 64)])
