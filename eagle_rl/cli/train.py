@@ -91,6 +91,8 @@ def _check_device(cfg: ExperimentCfg) -> None:
 def main(argv: Sequence[str]) -> int:
     """Run ``eagle train``."""
     args = _parser().parse_intermixed_args(argv)
+    if args.jobs < 1:
+        raise ConfigError(f"--jobs: got {args.jobs}, expected at least 1.")
     cfg = _configuration(args)
     if args.show:
         print(to_yaml(cfg), end="")
