@@ -11,6 +11,8 @@ from eagle_rl.config.compose import known_names
 from eagle_rl.config.schema import ExperimentCfg
 from eagle_rl.errors import ConfigError
 
+from .arguments import require_device
+
 if TYPE_CHECKING:
     from eagle_rl.models import EagleActor
 
@@ -38,6 +40,7 @@ def load_policy(path: Path, device: str = "cpu") -> Policy:
     from eagle_rl.runners.provenance import slot_table_hash
     from envs.robots.slots import SLOT_NAMES
 
+    require_device(device)
     checkpoint = find_checkpoint(path)
     actor, manifest = load_actor(checkpoint, device, slot_table_hash(SLOT_NAMES))
     cfg = experiment_from_plain(manifest["config"], str(checkpoint))

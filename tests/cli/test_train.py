@@ -93,7 +93,6 @@ def test_resume_refuses_another_experiment(runs, capsys):
         (("ppo", "robots=[g2]"), 3, "no robot named 'g2'. Did you mean g1?"),
         (("--resume", "nowhere"), 5, "not a run directory"),
         (("ppo", "--resume", ".", "--scale", "paper"), 2, "keeps the scale"),
-        (("ppo", "--jobs", "0"), 2, "--jobs: got 0"),
     ],
 )
 def test_bad_input_is_refused_in_words_and_leaves_nothing(runs, words, code, message, capsys):
