@@ -31,7 +31,11 @@ def _parser() -> argparse.ArgumentParser:
         epilog="Example: python play.py logs/quickstart/RUN --robots h1,g1 --video two.mp4",
     )
     parser.add_argument(
-        "checkpoint", nargs="?", type=Path, metavar="CKPT", help="checkpoint, stage or run [the published policy, or the newest run in logs/]"
+        "checkpoint",
+        nargs="?",
+        type=Path,
+        metavar="CKPT",
+        help="checkpoint, stage or run [the published policy, or the newest run in logs/]",
     )
     parser.add_argument("--robots", metavar="A,B|all", help="robots to show [those it was trained on]")
     parser.add_argument(
