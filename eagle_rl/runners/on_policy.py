@@ -26,7 +26,7 @@ from eagle_rl.runners.health import SickRule, require_sound
 from eagle_rl.runners.interrupt import InterruptGuard
 from eagle_rl.runners.progress import ProgressReport
 from eagle_rl.runners.provenance import Provenance
-from eagle_rl.runners.team import join_processes
+from eagle_rl.runners.team import join_processes, over_processes
 from eagle_rl.runners.training_log import TrainingLog
 
 
@@ -81,6 +81,7 @@ class EagleRunner(OnPolicyRunner):
             super().__init__(env, train_cfg, None, device)
         if self.is_distributed:
             self.alg.broadcast_parameters()
+            env.over_processes = over_processes
         torch.manual_seed(train_cfg["seed"] + self.gpu_global_rank)
         self.provenance = provenance or Provenance()
         self.folder = Path(log_dir) if log_dir is not None and self.gpu_global_rank == 0 else None
