@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from eagle_rl.errors import ConfigError
 
+from .arguments import count, device, require_folder
 from .policy import chosen_robots, load_policy
 
 if TYPE_CHECKING:
@@ -40,23 +41,25 @@ def _parser() -> argparse.ArgumentParser:
         "--out", type=Path, default=Path("figures"), metavar="DIR", help="folder of the figures [figures]"
     )
     parser.add_argument("--robots", metavar="A,B", help="robots to show, or all [those it was trained on]")
-    parser.add_argument("--device", default="cpu", metavar="cpu|cuda", help="where the policy computes [cpu]")
-    parser.add_argument("--envs", type=int, default=16, metavar="N", help="environments per robot [16]")
-    parser.add_argument("--steps", type=int, default=500, metavar="N", help="control steps of robustness runs [500]")
-    parser.add_argument("--smooth", type=int, default=10, metavar="N", help="iterations averaged in curves [10]")
+    parser.add_argument(
+        "--device", type=device, default="cpu", metavar="cpu|cuda", help="where the policy computes [cpu]"
+    )
+    parser.add_argument("--envs", type=count, default=16, metavar="N", help="environments per robot [16]")
+    parser.add_argument("--steps", type=count, default=500, metavar="N", help="control steps of robustness runs [500]")
+    parser.add_argument("--smooth", type=count, default=10, metavar="N", help="iterations averaged in curves [10]")
     return parser
 
 
 def _named(word: str) -> tuple[str, Path]:
     """``NAME=PATH``, or a path that names itself."""
     name, equals, path = word.partition("=")
-    return (name, Path(path)) if equals else (Path(word).name, Path(word))
+    return (name, Path(path)) if equals else (Path(word).stem, Path(word))
 
 
 def _curves(args: argparse.Namespace) -> dict[str, Figure]:
-    """One figure per stage that has begun."""
+    """One figure per stage that has begun, or of a file of curves; its numbers as csv."""
     from eagle_rl.evaluation import plots
-    from eagle_rl.evaluation.curves import read_curves
+    from eagle_rl.evaluation.curves import curves_to_csv, read_curves
     from eagle_rl.runners.records import read_plan, stage_dir
 
     figures = {}
@@ -65,9 +68,12 @@ def _curves(args: argparse.Namespace) -> dict[str, Figure]:
             {s.name: stage_dir(path, s.name) for s in read_plan(path)} if (path / "plan.json").exists() else {"": path}
         )
         for stage, folder in stages.items():
-            if (folder / "metrics.jsonl").exists() or len(stages) == 1:
+            file = folder if folder.is_file() else folder / "metrics.jsonl"
+            if file.exists() or len(stages) == 1:
                 title = f"{name}_{stage}".strip("_").replace("/", "_")
-                figures[title] = plots.learning_curves(read_curves(folder / "metrics.jsonl", args.smooth))
+                panels = read_curves(file, args.smooth)
+                figures[title] = plots.learning_curves(panels)
+                _write(args.out / f"curves_{title}.csv", curves_to_csv(panels))
     return figures
 
 
@@ -140,9 +146,13 @@ def _robustness(args: argparse.Namespace) -> dict[str, Figure]:
 
 
 def _write_numbers(path: Path, numbers: object) -> None:
-    """The numbers behind a figure."""
+    """The numbers behind a figure, as JSON."""
+    _write(path, json.dumps(numbers, indent=1) + "\n")
+
+
+def _write(path: Path, text: str) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(numbers, indent=1) + "\n", encoding="utf-8")
+    path.write_text(text, encoding="utf-8")
 
 
 DRAW: dict[str, Callable[[argparse.Namespace], dict[str, Figure]]] = {
@@ -158,6 +168,7 @@ DRAW: dict[str, Callable[[argparse.Namespace], dict[str, Figure]]] = {
 def main(argv: Sequence[str]) -> int:
     """Run ``eagle plot``."""
     args = _parser().parse_args(argv)
+    require_folder(args.out)
     figures = DRAW[args.figure](args)
     if not figures:
         raise ConfigError(f"{', '.join(args.paths)}: nothing to draw yet.")
