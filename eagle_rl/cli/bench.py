@@ -13,8 +13,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from eagle_rl.errors import EagleError, did_you_mean
+from eagle_rl.machine import usable_cores
 from eagle_rl.paths import data_root
 from eagle_rl.runners.provenance import versions
+
+from .arguments import count
 
 if TYPE_CHECKING:
     from benchmarks.measure import Figure
@@ -39,8 +42,8 @@ def _parser() -> argparse.ArgumentParser:
         epilog="Parts: " + "; ".join(f"{name}: {what}" for name, what in PARTS.items()) + ".",
     )
     parser.add_argument("parts", nargs="*", metavar="PART", help=f"what to measure [{' '.join(DEFAULT)}]")
-    parser.add_argument("--envs", type=int, default=512, metavar="N", help="environments over all robots [512]")
-    parser.add_argument("--threads", type=int, metavar="N", help="physics threads [one a core]")
+    parser.add_argument("--envs", type=count, default=512, metavar="N", help="environments over all robots [512]")
+    parser.add_argument("--threads", type=count, metavar="N", help="physics threads [one a core]")
     parser.add_argument("--seconds", type=float, default=10.0, metavar="S", help="time for each ratio [10]")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures into FILE too")
     return parser
@@ -111,7 +114,7 @@ def main(argv: Sequence[str]) -> int:
     for part in parts:
         if part not in PARTS:
             raise EagleError(f"eagle bench: no part {part!r}.{did_you_mean(part, PARTS)} Known: {', '.join(PARTS)}.")
-    threads = args.threads or len(os.sched_getaffinity(0))
+    threads = args.threads or usable_cores()
     _import_benchmarks()
     machine = _machine(args.envs, threads)
     figures: list[Figure] = []

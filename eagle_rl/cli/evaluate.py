@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from eagle_rl.config.schema import EvaluationCfg, ExperimentCfg
 from eagle_rl.errors import ConfigError
 
+from .arguments import count, device, require_folder, seconds
 from .policy import Policy, chosen_robots, load_policy
 
 if TYPE_CHECKING:
@@ -40,10 +41,10 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("checkpoints", nargs="+", metavar="[NAME=]CKPT", help="checkpoint, stage, run, or result .json")
     parser.add_argument("--robots", metavar="A,B", help="robots to judge on, or all [those it was trained on]")
-    parser.add_argument("--envs", type=int, metavar="N", help="environments per robot [the experiment's]")
-    parser.add_argument("--steps", type=int, metavar="N", help="control steps [the experiment's, 1000 in the paper]")
+    parser.add_argument("--envs", type=count, metavar="N", help="environments per robot [the experiment's]")
+    parser.add_argument("--steps", type=count, metavar="N", help="control steps [the experiment's, 1000 in the paper]")
     parser.add_argument("--protocol", choices=("single", "joint"), help="draw one command at a time, or all five")
-    parser.add_argument("--resample", type=float, metavar="S", help="redraw commands every S seconds, 0 never")
+    parser.add_argument("--resample", type=seconds, metavar="S", help="redraw commands every S seconds, 0 never")
     parser.add_argument("--seed", type=int, metavar="N", help="seed of commands and randomization")
     parser.add_argument("--randomize", action="store_true", help="randomized dynamics, with pushes")
     parser.add_argument("--noise", action="store_true", help="sensor noise")
@@ -53,7 +54,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--falls", choices=("charged", "errors"), default="charged", help="charge |c_d| after a fall, or stop"
     )
-    parser.add_argument("--device", default="cpu", metavar="cpu|cuda", help="where the policy computes [cpu]")
+    parser.add_argument(
+        "--device", type=device, default="cpu", metavar="cpu|cuda", help="where the policy computes [cpu]"
+    )
     parser.add_argument("--out", type=Path, metavar="DIR", help="write results and table.{md,csv,tex,json} here")
     return parser
 
@@ -116,6 +119,8 @@ def main(argv: Sequence[str]) -> int:
 
     if args.subset not in SUBSETS:
         raise ConfigError(f"--subset: got {args.subset!r}, expected one of {', '.join(SUBSETS)}.")
+    if args.out is not None:
+        require_folder(args.out)
     console = Console(stderr=True)
     results: dict[str, list[EvaluationResult]] = {}
     for name, path in map(_split, args.checkpoints):

@@ -50,6 +50,11 @@ def guarded(action: Callable[[], int]) -> int:
     except BrokenPipeError:  # the reader, such as head, has left
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except OSError as error:
+        if error.filename is None:
+            raise
+        print(f"error: {error.filename}: {error.strerror}.", file=sys.stderr)
+        return EagleError.exit_code
 
 
 def run_verb(verb: str, argv: Sequence[str]) -> int:

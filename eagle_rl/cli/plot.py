@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from eagle_rl.errors import ConfigError
 
+from .arguments import count, device, require_folder
 from .policy import chosen_robots, load_policy
 
 if TYPE_CHECKING:
@@ -40,10 +41,12 @@ def _parser() -> argparse.ArgumentParser:
         "--out", type=Path, default=Path("figures"), metavar="DIR", help="folder of the figures [figures]"
     )
     parser.add_argument("--robots", metavar="A,B", help="robots to show, or all [those it was trained on]")
-    parser.add_argument("--device", default="cpu", metavar="cpu|cuda", help="where the policy computes [cpu]")
-    parser.add_argument("--envs", type=int, default=16, metavar="N", help="environments per robot [16]")
-    parser.add_argument("--steps", type=int, default=500, metavar="N", help="control steps of robustness runs [500]")
-    parser.add_argument("--smooth", type=int, default=10, metavar="N", help="iterations averaged in curves [10]")
+    parser.add_argument(
+        "--device", type=device, default="cpu", metavar="cpu|cuda", help="where the policy computes [cpu]"
+    )
+    parser.add_argument("--envs", type=count, default=16, metavar="N", help="environments per robot [16]")
+    parser.add_argument("--steps", type=count, default=500, metavar="N", help="control steps of robustness runs [500]")
+    parser.add_argument("--smooth", type=count, default=10, metavar="N", help="iterations averaged in curves [10]")
     return parser
 
 
@@ -165,6 +168,7 @@ DRAW: dict[str, Callable[[argparse.Namespace], dict[str, Figure]]] = {
 def main(argv: Sequence[str]) -> int:
     """Run ``eagle plot``."""
     args = _parser().parse_args(argv)
+    require_folder(args.out)
     figures = DRAW[args.figure](args)
     if not figures:
         raise ConfigError(f"{', '.join(args.paths)}: nothing to draw yet.")

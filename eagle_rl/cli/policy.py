@@ -11,6 +11,8 @@ from eagle_rl.config.compose import known_names
 from eagle_rl.config.schema import ExperimentCfg
 from eagle_rl.errors import ConfigError
 
+from .arguments import require_device
+
 if TYPE_CHECKING:
     from eagle_rl.models import EagleActor
 
@@ -31,6 +33,7 @@ class Policy:
 def load_policy(path: Path, device: str = "cpu") -> Policy:
     """The policy a path means; on another device than it was trained on, if asked."""
     from eagle_rl.config.load import experiment_from_plain
+    from eagle_rl.machine import own_cores
     from eagle_rl.models.precision import set_up_torch
     from eagle_rl.runners.checkpoint import load_actor
     from eagle_rl.runners.judged import training_steps
@@ -39,10 +42,11 @@ def load_policy(path: Path, device: str = "cpu") -> Policy:
     from eagle_rl.runners.published import SUFFIX
     from envs.robots.slots import SLOT_NAMES
 
+    require_device(device)
     checkpoint = find_checkpoint(path)
     actor, manifest = load_actor(checkpoint, device, slot_table_hash(SLOT_NAMES))
     cfg = experiment_from_plain(manifest["config"], str(checkpoint))
-    set_up_torch(cfg.run.torch_threads)
+    set_up_torch(cfg.run.torch_threads or own_cores())
     cfg = dataclasses.replace(cfg, run=dataclasses.replace(cfg.run, device=device))
     env_steps = manifest["env_steps"] if checkpoint.suffix == SUFFIX else training_steps(checkpoint)
     return Policy(actor, cfg, manifest["sha256"], env_steps)

@@ -15,6 +15,9 @@ from .mdp_summary import make_table, randomization_table
 if TYPE_CHECKING:
     from envs.robots.spec import RobotSpec
 
+TABLE_WIDTH = 160
+"""Columns that the widest table needs; a narrower terminal wraps lines, which reads better than folded cells."""
+
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="eagle robots", description=__doc__)
@@ -59,7 +62,7 @@ def _show(spec: RobotSpec, console: Console) -> None:
     console.print(f"\nswing height {spec.swing_height:.3f} m, base {spec.base_link}, IMU on {spec.imu_link}")
     console.print(f"{spec.yaml_path}\n{spec.urdf_path}", highlight=False, soft_wrap=True)
     for topic, source in spec.sources.items():
-        console.print(f"{topic}: {source}", highlight=False, markup=False)
+        console.print(f"{topic}: {source}", highlight=False, markup=False, soft_wrap=True)
 
 
 def _show_randomization(spec: RobotSpec, console: Console) -> None:
@@ -76,16 +79,17 @@ def _check(name: str, console: Console) -> None:
 
     findings = check_robot(name)
     spec = load_robot(name)
-    verdict = f"{len(findings)} to know" if findings else "in order"
+    verdict = "can be used" + (f"; {len(findings)} worth knowing:" if findings else "")
     console.print(f"{spec.name}: {spec.num_joints} joints, {spec.total_mass:.3f} kg: {verdict}", highlight=False)
     for finding in findings:
-        console.print(f"  {finding}", highlight=False, markup=False)
+        console.print(f"  {finding}", highlight=False, markup=False, soft_wrap=True)
 
 
 def main(argv: Sequence[str]) -> int:
     """Run ``eagle robots``."""
     args = _parser().parse_args(argv)
     console = Console()
+    console.width = max(console.width, TABLE_WIDTH)
     if args.action == "list":
         _list(console)
     elif args.action == "slots":

@@ -15,6 +15,7 @@ from eagle_rl.errors import ConfigError
 from eagle_rl.runners.plan import plan_stages
 from eagle_rl.runners.provenance import Provenance, content_hash, slot_table_hash
 
+from .arguments import count, require_device
 from .run_directory import create_run, open_run
 
 if TYPE_CHECKING:
@@ -46,7 +47,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--seed", type=int, metavar="N", help="the same as seed=N")
     parser.add_argument("--device", metavar="cpu|cuda", help="where the learner computes, the same as run.device=...")
     parser.add_argument("--scale", choices=known_names("scale"), help="lay cfg/scale/NAME.yaml over the experiment")
-    parser.add_argument("--jobs", type=int, default=1, metavar="K", help="train K specialists side by side [1]")
+    parser.add_argument("--jobs", type=count, default=1, metavar="K", help="train K specialists side by side [1]")
     parser.add_argument("--allow-drift", action="store_true", help="resume although versions, robots or values changed")
     parser.add_argument("--show", action="store_true", help="print the resolved configuration and stop")
     return parser
@@ -81,13 +82,6 @@ def _provenance(cfg: ExperimentCfg) -> Provenance:
     return Provenance(config=asdict(cfg), robots=robots, slot_table_hash=slot_table_hash(SLOT_NAMES))
 
 
-def _check_device(cfg: ExperimentCfg) -> None:
-    import torch
-
-    if cfg.run.device != "cpu" and not torch.cuda.is_available():
-        raise ConfigError(f"run.device: {cfg.run.device} is not available here: torch finds no CUDA device. Use cpu.")
-
-
 def main(argv: Sequence[str]) -> int:
     """Run ``eagle train``."""
     args = _parser().parse_intermixed_args(argv)
@@ -96,7 +90,7 @@ def main(argv: Sequence[str]) -> int:
         print(to_yaml(cfg), end="")
         return 0
     provenance = _provenance(cfg)
-    _check_device(cfg)
+    require_device(cfg.run.device)
 
     from eagle_rl.runners.team import Team
 

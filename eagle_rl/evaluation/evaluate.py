@@ -73,9 +73,7 @@ class EvaluationResult:
         """Read back ``to_json``."""
         data = json.loads(text)
         if data.get("format") != FORMAT:
-            raise CheckpointError(
-                f"evaluation result: format {data.get('format')!r}, expected {FORMAT}. Evaluate again."
-            )
+            raise CheckpointError(f"format {data.get('format')!r}, expected {FORMAT}: evaluate again")
         return cls(
             checkpoint=data["checkpoint"],
             protocol=EvaluationCfg(**data["protocol"]),
@@ -86,8 +84,15 @@ class EvaluationResult:
 
     @classmethod
     def read(cls, path: Path) -> EvaluationResult:
-        """Read a result file."""
-        return cls.from_json(path.read_text(encoding="utf-8"))
+        """Read a result file.
+
+        Raises:
+            CheckpointError: it is none.
+        """
+        try:
+            return cls.from_json(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            raise CheckpointError(f"{path}: not a result of eagle evaluate: {error}.") from error
 
 
 def evaluate(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from eagle_rl.config.schema import CommandsCfg, GaitCfg, Range
+from eagle_rl.config.schema import GaitCfg
 
 from ..state import PooledRobots, PooledState
 from .gait import homogenise
@@ -40,24 +40,3 @@ def contact_match(state: PooledState, cfg: GaitCfg) -> Tensor:
     """Share of the feet whose contact agrees with the clock (stance, where C > 0.5), shape (N,)."""
     desired = homogenise(state.foot_phase, cfg.stance_ratio) < 0.5
     return (desired == state.foot_contact).to(state.foot_phase.dtype).mean(dim=1)
-
-
-def _mean_abs(low: float, high: float) -> float:
-    """Mean of |x| for x uniform in [low, high]."""
-    if low >= 0.0 or high <= 0.0:
-        return abs(low + high) / 2.0
-    return (low**2 + high**2) / (2.0 * (high - low))
-
-
-def _finishing_ranges(cfg: CommandsCfg) -> list[Range]:
-    return [getattr(cfg, name).finishing for name in ERROR_NAMES]
-
-
-def floor_stand_still(cfg: CommandsCfg) -> tuple[float, ...]:
-    """Errors of a robot that stands upright at its nominal height whatever it is told, in the order of ERROR_NAMES."""
-    return tuple(_mean_abs(low, high) for low, high in _finishing_ranges(cfg))
-
-
-def floor_best_constant(cfg: CommandsCfg) -> tuple[float, ...]:
-    """Errors of a robot that holds the middle of each finishing range whatever it is told."""
-    return tuple((high - low) / 4.0 for low, high in _finishing_ranges(cfg))

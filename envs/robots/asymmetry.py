@@ -12,6 +12,14 @@ from .tree import Body, Pose
 from .urdf import read_urdf
 
 _FLIP = np.diag([1.0, -1.0, 1.0])
+_UNITS = {
+    "mass": "kg",
+    "centre of mass": "m",
+    "inertia": "kg m^2",
+    "joint position": "m",
+    "joint orientation": "rad",
+    "limits": "rad",
+}
 _LENGTH = 0.1
 """Length that differences of positions are compared with [m]."""
 
@@ -24,14 +32,20 @@ class Asymmetry:
     partner: str
     quantity: str
     difference: float
-    """Largest absolute difference: mass [kg], position [m], inertia [kg m^2], angle [rad]."""
+    """Largest absolute difference, in ``unit``."""
     relative: float
     """The same relative to the quantity's own size, positions to 0.1 m, angles to 1 rad [-]."""
 
     def __str__(self) -> str:
         """Say it in one line."""
-        against = "itself" if self.body == self.partner else self.partner
-        return f"{self.quantity} of {self.body} against {against}: {self.difference:.3g} ({self.relative:.2%})"
+        whose = "its own" if self.body == self.partner else f"{self.partner}'s"
+        size = f"{self.difference:.3g} {self.unit} ({self.relative:.2%})"
+        return f"{self.quantity} of {self.body}: {size} off {whose} mirror image"
+
+    @property
+    def unit(self) -> str:
+        """Unit of ``difference``."""
+        return _UNITS[self.quantity]
 
 
 def asymmetries(spec: RobotSpec, tolerance: float = 1e-9) -> list[Asymmetry]:

@@ -50,7 +50,7 @@ def check_robot(name_or_path: str | Path) -> list[str]:
         *_shape_findings(spec, tree),
         *_contact_findings(model, data),
         *_gain_findings(spec, model, data),
-        *(f"not left/right symmetric: {item}" for item in asymmetries(spec) if item.relative > MAX_ASYMMETRY),
+        *(str(item) for item in asymmetries(spec) if item.relative > MAX_ASYMMETRY),
     ]
 
 

@@ -1,0 +1,167 @@
+"""What a user can get wrong: one message, the right exit code, no traceback, and every file as it was."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from eagle_rl.cli.main import run_verb
+from eagle_rl.config.load import load_experiment, to_yaml
+from eagle_rl.paths import data_root
+from eagle_rl.runners import checkpoint as ckpt
+from tests.policy import untrained_checkpoint
+
+ROOT = Path(__file__).parents[2]
+
+
+def everything(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.fixture
+def refused(tmp_path, capsys):
+    """Runs a verb that must fail with a code and a message, and leave the folder as it was."""
+
+    def check(words: list[str], code: int, *parts: str) -> None:
+        before = everything(tmp_path)
+        try:
+            got = run_verb(words[0], words[1:])
+        except SystemExit as error:  # argparse
+            got = error.code
+        message = capsys.readouterr().err
+        assert got == code, message
+        assert "Traceback" not in message
+        for part in parts:
+            assert part in message
+        assert everything(tmp_path) == before
+
+    return check
+
+
+@pytest.fixture
+def checkpoint(tmp_path) -> Path:
+    return untrained_checkpoint(tmp_path / "checkpoints", "h1")
+
+
+def robot_file(folder: Path, urdf: str) -> Path:
+    """H1's YAML with another URDF."""
+    text = (data_root() / "cfg/robots/h1.yaml").read_text(encoding="utf-8")
+    path = folder / "mine.yaml"
+    path.write_text(text.replace("../../assets/urdf/h1.urdf", urdf), encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "message"),
+    [
+        (["pppo"], 2, "Did you mean ppo?"),
+        (["ppo", "robots=[h1, g2]"], 3, "Did you mean g1?"),
+        (["ppo", "task.rewards.weigths.alive=1"], 2, "Did you mean weights?"),
+        (["ppo", "algo.gamma=high"], 2, "algo.gamma: got 'high', expected a number"),
+        (["ppo", "num_envs=3.5"], 2, "num_envs: got 3.5"),
+        (["ppo", "--out", "taken"], 2, "Choose another with --out"),
+        (["--resume", "."], 5, "not a run directory"),
+        (["ppo", "--device", "tpu"], 2, "expected cpu, cuda"),
+        (["ppo", "--jobs", "0"], 2, "expected a whole number above 0"),
+    ],
+)
+def test_a_command_typed_into_a_shell_is_refused_within_its_message(tmp_path, words, code, message):
+    (tmp_path / "taken").write_text("a file")
+    command = [sys.executable, str(ROOT / "train.py"), *words]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=os.environ)
+    assert done.returncode == code, done.stderr
+    assert message in done.stderr
+    assert "Traceback" not in done.stderr
+    assert done.stdout == ""
+    assert everything(tmp_path) == {tmp_path / "taken": b"a file"}
+
+
+def test_every_fault_of_a_file_is_in_one_message(refused):
+    text = to_yaml(load_experiment("ppo")).replace("gamma:", "gama:").replace("num_envs: ", "num_envs: many # ")
+    Path("mine.yaml").write_text(text)
+    refused(["train", "mine.yaml"], 2, "num_envs: got 'many'", "Did you mean gamma?")
+
+
+def test_a_missing_urdf_is_named(refused, tmp_path):
+    path = robot_file(tmp_path, "gone.urdf")
+    for words in (["train", "smoke", f"robots=[{path}]"], ["robots", "check", str(path)]):
+        refused(words, 3, "gone.urdf", "Check `urdf`")
+
+
+def test_a_link_without_mass_is_named(refused, tmp_path):
+    urdf = (data_root() / "assets/urdf/h1.urdf").read_text(encoding="utf-8")
+    start = urdf.index('<mass value="', urdf.index('<link name="left_knee_link"'))
+    urdf = urdf[:start] + '<mass value="0"/>' + urdf[urdf.index("/>", start) + 2 :]
+    (tmp_path / "light.urdf").write_text(urdf, encoding="utf-8")
+    path = robot_file(tmp_path, "light.urdf")
+    for words in (["train", "smoke", f"robots=[{path}]"], ["robots", "check", str(path)]):
+        refused(words, 3, "left_knee_link", "mass is 0 kg, expected more than 0")
+
+
+USES = (["play"], ["evaluate"], ["export"], ["plot", "response"])
+"""Every verb that takes a policy."""
+
+
+@pytest.mark.parametrize("verb", USES, ids=" ".join)
+def test_a_policy_of_another_slot_table_is_refused(refused, checkpoint, verb):
+    manifest = ckpt.read_manifest(checkpoint) | {"slot_table_hash": "0123456789abcdef"}
+    checkpoint.with_suffix(".json").write_bytes(ckpt._encode_manifest(manifest))
+    refused([*verb, str(checkpoint)], 5, "another slot table (0123456789ab)", checkpoint.name)
+
+
+@pytest.mark.parametrize("verb", USES, ids=" ".join)
+def test_a_damaged_checkpoint_is_refused_by_name(refused, checkpoint, verb):
+    whole = checkpoint.read_bytes()
+    checkpoint.write_bytes(whole[: len(whole) // 2])
+    refused([*verb, str(checkpoint)], 5, f"{checkpoint.name}: damaged: {len(whole) // 2} bytes")
+    middle = len(whole) // 2
+    checkpoint.write_bytes(whole[:middle] + bytes([whole[middle] ^ 1]) + whole[middle + 1 :])
+    refused([*verb, str(checkpoint)], 5, f"{checkpoint.name}: damaged: its sha256")
+
+
+@pytest.mark.parametrize("verb", USES, ids=" ".join)
+def test_where_no_checkpoint_is_it_is_said_so(refused, verb):
+    refused([*verb, "nowhere"], 5, "nowhere: no checkpoint there")
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "message"),
+    [
+        (["evaluate", "--envs", "0"], 2, "--envs: got '0', expected a whole number above 0"),
+        (["evaluate", "--steps", "-5"], 2, "--steps: got '-5'"),
+        (["evaluate", "--resample", "nan"], 2, "--resample: got 'nan', expected a time"),
+        (["evaluate", "--device", "tpu"], 2, "--device: got 'tpu'"),
+        (["evaluate", "--robots", "g2"], 3, "Did you mean g1?"),
+        (["evaluate", "--out", "taken/here"], 2, "taken is a file"),
+        (["plot", "curves", "--out", "taken"], 2, "taken is a file"),
+        (["plot", "latents", "--envs", "1.5"], 2, "--envs: got '1.5'"),
+        (["export", "--out", "nowhere/p.onnx"], 2, "there is no folder nowhere"),
+        (["play", "--video", "nowhere/v.mp4"], 2, "there is no folder nowhere"),
+        (["play", "--commands", "taken"], 2, "taken"),
+    ],
+)
+def test_a_wrong_option_is_named(refused, checkpoint, words, code, message):
+    Path("taken").write_text("a file")
+    refused([words[0], *words[1:-2], str(checkpoint), *words[-2:]], code, message)
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"format": 0}', "\0"])
+def test_a_file_that_is_no_evaluation_is_refused_by_name(refused, text):
+    Path("result.json").write_text(text)
+    refused(["evaluate", "result.json"], 5, "result.json: not a result of eagle evaluate")
+
+
+def test_status_of_a_folder_that_is_no_run_is_refused(refused):
+    refused(["status", "."], 2, "this is no run of an experiment")
+
+
+def test_a_file_the_system_refuses_is_named_without_a_traceback(refused, monkeypatch):
+    def full(*args):
+        raise OSError(28, "No space left on device", "logs/table.md")
+
+    monkeypatch.setattr("eagle_rl.cli.doctor.main", full)
+    refused(["doctor"], 2, "error: logs/table.md: No space left on device.")
