@@ -3,6 +3,7 @@
 #   make train     the quickstart experiment: the whole loop on five robots, a tracking table at the end
 #   make play      the published policy, or CKPT=PATH, on five robots side by side
 #   make test      all tests            make check     format, lint, types
+#   make results   tables and figures of docs/results from the published policy (a quarter of an hour on two cores)
 #   make bench     throughput           make package   sdist and wheel, installed and tried in an empty folder
 #   make mutants   break the mathematics in 55 places, one at a time: do the tests notice? (about ten minutes)
 #   make clean     remove what was built (never logs/)
@@ -15,12 +16,13 @@ VENV ?= .venv
 CONSTRAINTS ?= -c constraints.txt
 PIP_ARGS ?=
 CKPT ?=
+RESULT_ENVS ?= 256
 
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 INSTALLED := $(VENV)/.installed
 
-.PHONY: setup train play test check bench mutants package clean help
+.PHONY: setup train play test check results bench mutants package clean help
 
 help:
 	@sed -n 's/^# \{0,1\}//p' Makefile
@@ -47,6 +49,19 @@ check: $(INSTALLED)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+POLICY := checkpoints/generalist
+RESULTS := docs/results
+
+results: $(INSTALLED)
+	rm -rf $(RESULTS)/joint $(RESULTS)/single
+	$(BIN)/eagle evaluate $(POLICY).safetensors --protocol joint --envs $(RESULT_ENVS) --out $(RESULTS)/joint
+	$(BIN)/eagle evaluate $(POLICY).safetensors --protocol single --envs $(RESULT_ENVS) --out $(RESULTS)/single
+	$(BIN)/eagle plot response $(POLICY).safetensors --out $(RESULTS)
+	$(BIN)/eagle plot latents $(POLICY).safetensors --out $(RESULTS)
+	$(BIN)/eagle plot curves root=$(RESULTS)/curves/curves_root.csv --smooth 1 --out $(RESULTS)/curves
+	$(BIN)/python play.py $(POLICY).safetensors --viewer none --contact-sheet $(RESULTS)/demo.png
+	for robot in h1 g1 t1 n1 adam; do $(BIN)/eagle sim2sim $(POLICY).onnx --robot $$robot; done > $(RESULTS)/sim2sim.txt
 
 bench: $(INSTALLED)
 	$(BIN)/eagle bench

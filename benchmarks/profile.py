@@ -37,7 +37,7 @@ SECTIONS: tuple[tuple[object, str, str, bool], ...] = (
     (ppo.nn.utils, "clip_grad_norm_", "optimiser", False),
     (torch.optim.Adam, "zero_grad", "optimiser", False),
     (torch.optim.Adam, "step", "optimiser", False),
-    (on_policy, "require_finite", "logging", False),
+    (on_policy, "require_sound", "logging", False),
     (TrainingLog, "add_step", "logging", False),
     (TrainingLog, "collect", "logging", False),
     (TrainingLog, "write", "logging", False),

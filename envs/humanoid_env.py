@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from rsl_rl.env import VecEnv
@@ -50,6 +50,8 @@ from .sim.terrain import build_terrain
 from .state import PooledState
 from .step_log import StepLog, episode_ratio
 
+Pooling = Literal["mean", "max"]
+
 
 class HumanoidEnv(VecEnv):
     """Whole-body command tracking by a mixed fleet of humanoids.
@@ -60,6 +62,8 @@ class HumanoidEnv(VecEnv):
     num_actions = NUM_SLOTS
     final_observations_of_falls = False
     """Whether ``final_ids`` also lists environments that terminated; the learner has no use for those."""
+    over_processes: Callable[[Tensor, Pooling], Tensor] = staticmethod(lambda x, how: x)
+    """Pools what the curriculum goes by with other processes that train the same policy, once an interval."""
 
     def __init__(
         self,
@@ -339,8 +343,10 @@ class HumanoidEnv(VecEnv):
         if self.common_step_counter % self.task.aids.interval_steps:
             return {}
         entry, falls_per_step, match_per_robot = self.step_log.flush()
-        self.aids.update(episode_ratio(falls_per_step, self.max_episode_length), match_per_robot)
+        falls, match_per_robot = self.over_processes(torch.stack((falls_per_step, match_per_robot)), "mean")
+        self.aids.update(episode_ratio(falls, self.max_episode_length), match_per_robot)
         self._apply_aids()
+        self.commands.sampler.weights = self.over_processes(self.commands.sampler.weights, "max")
         entry["Curriculum/penalty_scale"] = torch.tensor(self.penalty_scale)
         names = self.robot_names
         return entry | self.commands.log() | self.aids.log(names) | self.ground.log(names)

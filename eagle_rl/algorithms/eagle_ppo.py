@@ -119,6 +119,8 @@ class EaglePPO(PPO):
         super().compute_returns(obs)
         if not self.cfg.use_ppo_loss:
             self.storage.advantages.zero_()
+        elif self.gpu_world_size > 1:
+            self._normalize_over_processes()
 
     def update(self) -> dict[str, float]:
         """Label the rollout, optimise the sum of all losses, adapt the learning rate; return scalars by tag."""
@@ -173,6 +175,16 @@ class EaglePPO(PPO):
             self.learning_rate = min(high, self.learning_rate * LEARNING_RATE_FACTOR)
         for group in self.optimizer.param_groups:
             group["lr"] = self.learning_rate
+
+    def _normalize_over_processes(self) -> None:
+        """Give the advantages of all processes together zero mean and unit variance, as one process would."""
+        advantages = self.storage.returns - self.storage.values
+        moments = advantages.new_tensor([advantages.numel(), 0.0, 0.0], dtype=torch.float64)
+        moments[1], moments[2] = advantages.double().sum(), advantages.double().square().sum()
+        torch.distributed.all_reduce(moments)
+        count, total, squares = moments.tolist()
+        variance = (squares - total**2 / count) / (count - 1)
+        self.storage.advantages = (advantages - total / count) / (math.sqrt(variance) + 1e-8)
 
     def _mean_over_processes(self, value: Tensor) -> float:
         if self.gpu_world_size > 1:

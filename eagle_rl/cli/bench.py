@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from eagle_rl.errors import EagleError, did_you_mean
+from eagle_rl.machine import usable_cores
 from eagle_rl.paths import data_root
 from eagle_rl.runners.provenance import versions
 
@@ -113,7 +114,7 @@ def main(argv: Sequence[str]) -> int:
     for part in parts:
         if part not in PARTS:
             raise EagleError(f"eagle bench: no part {part!r}.{did_you_mean(part, PARTS)} Known: {', '.join(PARTS)}.")
-    threads = args.threads or len(os.sched_getaffinity(0))
+    threads = args.threads or usable_cores()
     _import_benchmarks()
     machine = _machine(args.envs, threads)
     figures: list[Figure] = []

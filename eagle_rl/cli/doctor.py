@@ -18,6 +18,7 @@ from packaging.requirements import Requirement
 from eagle_rl.config.compose import known_names
 from eagle_rl.config.load import load_experiment
 from eagle_rl.errors import EagleError
+from eagle_rl.machine import usable_cores
 from eagle_rl.paths import data_root
 
 _RENDER = """
@@ -62,11 +63,14 @@ def installed_version(package: str) -> str:
 
 def check_machine() -> list[Finding]:
     """Python, operating system and cores that this process may use."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     threads = os.environ.get("OMP_NUM_THREADS", "not set")
     return [
         Finding("python", "ok", f"{platform.python_version()} on {platform.platform()}"),
-        Finding("cores", "ok", f"{cores} usable; OMP_NUM_THREADS {threads}; physics uses all, torch run.torch_threads"),
+        Finding(
+            "cores",
+            "ok",
+            f"{usable_cores()} usable, all are used; OMP_NUM_THREADS {threads}",
+        ),
     ]
 
 

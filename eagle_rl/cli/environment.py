@@ -7,6 +7,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from eagle_rl.config.schema import RunCfg, TaskCfg
+from eagle_rl.machine import own_cores
 
 if TYPE_CHECKING:
     from rsl_rl.env import VecEnv
@@ -29,4 +30,5 @@ def _make_env(run: RunCfg, robots: Sequence[str], num_envs: int, task: TaskCfg, 
     from envs.robots.load import load_robot
 
     specs = [load_robot(name) for name in robots]
-    return HumanoidEnv(task, specs, num_envs, seed, device=run.device, num_threads=run.num_threads)
+    threads = run.num_threads or own_cores()
+    return HumanoidEnv(task, specs, num_envs, seed, device=run.device, num_threads=threads)

@@ -28,6 +28,7 @@ METHODS = {
     "eagle": "EAGLE",
     "eagle_id": "EAGLE w/ ID",
     "single": "single-robot PPO",
+    "published": "PPO",
 }
 """The paper's name for each of its experiments."""
 
@@ -139,8 +140,11 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _is_result(path: Path) -> bool:
-    """Whether a path is a stored result, not the manifest of a checkpoint."""
-    return path.suffix == ".json" and not path.name.startswith("model_")
+    """Whether a path is a stored result, not the manifest of a policy."""
+    from eagle_rl.runners.published import SUFFIX
+
+    manifest = path.name.startswith("model_") or path.with_suffix(SUFFIX).exists()
+    return path.suffix == ".json" and not manifest
 
 
 def _write(folder: Path, results: Mapping[str, Sequence[EvaluationResult]], table: Table) -> None:

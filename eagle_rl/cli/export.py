@@ -1,4 +1,4 @@
-"""``eagle export``: a checkpoint as one ONNX file with its input/output contract."""
+"""``eagle export``: a checkpoint as one ONNX file with its input/output contract, or as a set of files to publish."""
 
 from __future__ import annotations
 
@@ -26,6 +26,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("checkpoint", type=Path, metavar="CKPT", help="checkpoint, stage or run")
     parser.add_argument(
         "--out", type=Path, metavar="FILE.onnx", help="[next to the checkpoint, with the contract's hash in its name]"
+    )
+    parser.add_argument(
+        "--publish", type=Path, metavar="NAME", help="write NAME.safetensors, NAME.json and NAME.onnx instead"
     )
     return parser
 
@@ -94,21 +97,28 @@ def _robot(spec: RobotSpec, cfg: ExperimentCfg) -> RobotContract:
 def main(argv: Sequence[str]) -> int:
     """Run ``eagle export``."""
     args = _parser().parse_args(argv)
+    if args.out is not None and args.publish is not None:
+        raise ConfigError("--out and --publish: --publish names its own ONNX file. Give one of them.")
     if args.out is not None and not args.out.absolute().parent.is_dir():
         raise ConfigError(f"--out {args.out}: there is no folder {args.out.parent}. Make it first.")
 
     from eagle_rl.config.load import experiment_from_plain
     from eagle_rl.export.onnx import export_onnx
-    from eagle_rl.runners.checkpoint import load_actor
+    from eagle_rl.runners.checkpoint import load_actor, publish_policy
+    from eagle_rl.runners.judged import training_steps
     from eagle_rl.runners.locate import find_checkpoint
     from eagle_rl.runners.provenance import slot_table_hash
     from envs.robots.slots import SLOT_NAMES
 
     checkpoint = find_checkpoint(args.checkpoint)
+    if args.publish is not None:
+        checkpoint = publish_policy(checkpoint, args.publish, training_steps(checkpoint))
+        print(f"{checkpoint}, with its manifest in {checkpoint.with_suffix('.json').name}")
     actor, manifest = load_actor(checkpoint, slot_table_hash=slot_table_hash(SLOT_NAMES))
     cfg = experiment_from_plain(manifest["config"], str(checkpoint))
     contract = build_contract(cfg, manifest["sha256"], cfg.robots)
-    out = args.out or checkpoint.with_name(f"{checkpoint.stem}_{contract.digest[:8]}.onnx")
+    name = checkpoint.stem if args.publish else f"{checkpoint.stem}_{contract.digest[:8]}"
+    out = args.out or checkpoint.with_name(f"{name}.onnx")
     difference = export_onnx(actor, contract, out)
     print(f"{out}: {', '.join(contract.robots)}; differs from torch by at most {difference:.1g}")
     return 0

@@ -53,13 +53,13 @@ def _parser() -> argparse.ArgumentParser:
 def _named(word: str) -> tuple[str, Path]:
     """``NAME=PATH``, or a path that names itself."""
     name, equals, path = word.partition("=")
-    return (name, Path(path)) if equals else (Path(word).name, Path(word))
+    return (name, Path(path)) if equals else (Path(word).stem, Path(word))
 
 
 def _curves(args: argparse.Namespace) -> dict[str, Figure]:
-    """One figure per stage that has begun."""
+    """One figure per stage that has begun, or of a file of curves; its numbers as csv."""
     from eagle_rl.evaluation import plots
-    from eagle_rl.evaluation.curves import read_curves
+    from eagle_rl.evaluation.curves import curves_to_csv, read_curves
     from eagle_rl.runners.records import read_plan, stage_dir
 
     figures = {}
@@ -68,9 +68,12 @@ def _curves(args: argparse.Namespace) -> dict[str, Figure]:
             {s.name: stage_dir(path, s.name) for s in read_plan(path)} if (path / "plan.json").exists() else {"": path}
         )
         for stage, folder in stages.items():
-            if (folder / "metrics.jsonl").exists() or len(stages) == 1:
+            file = folder if folder.is_file() else folder / "metrics.jsonl"
+            if file.exists() or len(stages) == 1:
                 title = f"{name}_{stage}".strip("_").replace("/", "_")
-                figures[title] = plots.learning_curves(read_curves(folder / "metrics.jsonl", args.smooth))
+                panels = read_curves(file, args.smooth)
+                figures[title] = plots.learning_curves(panels)
+                _write(args.out / f"curves_{title}.csv", curves_to_csv(panels))
     return figures
 
 
@@ -143,9 +146,13 @@ def _robustness(args: argparse.Namespace) -> dict[str, Figure]:
 
 
 def _write_numbers(path: Path, numbers: object) -> None:
-    """The numbers behind a figure."""
+    """The numbers behind a figure, as JSON."""
+    _write(path, json.dumps(numbers, indent=1) + "\n")
+
+
+def _write(path: Path, text: str) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(numbers, indent=1) + "\n", encoding="utf-8")
+    path.write_text(text, encoding="utf-8")
 
 
 DRAW: dict[str, Callable[[argparse.Namespace], dict[str, Figure]]] = {

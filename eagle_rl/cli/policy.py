@@ -33,20 +33,23 @@ class Policy:
 def load_policy(path: Path, device: str = "cpu") -> Policy:
     """The policy a path means; on another device than it was trained on, if asked."""
     from eagle_rl.config.load import experiment_from_plain
+    from eagle_rl.machine import own_cores
     from eagle_rl.models.precision import set_up_torch
     from eagle_rl.runners.checkpoint import load_actor
     from eagle_rl.runners.judged import training_steps
     from eagle_rl.runners.locate import find_checkpoint
     from eagle_rl.runners.provenance import slot_table_hash
+    from eagle_rl.runners.published import SUFFIX
     from envs.robots.slots import SLOT_NAMES
 
     require_device(device)
     checkpoint = find_checkpoint(path)
     actor, manifest = load_actor(checkpoint, device, slot_table_hash(SLOT_NAMES))
     cfg = experiment_from_plain(manifest["config"], str(checkpoint))
-    set_up_torch(cfg.run.torch_threads)
+    set_up_torch(cfg.run.torch_threads or own_cores())
     cfg = dataclasses.replace(cfg, run=dataclasses.replace(cfg.run, device=device))
-    return Policy(actor, cfg, manifest["sha256"], training_steps(checkpoint))
+    env_steps = manifest["env_steps"] if checkpoint.suffix == SUFFIX else training_steps(checkpoint)
+    return Policy(actor, cfg, manifest["sha256"], env_steps)
 
 
 def chosen_robots(text: str | None, cfg: ExperimentCfg) -> tuple[str, ...]:

@@ -41,7 +41,7 @@ BOUNDS: dict[str, _Bound] = dict.fromkeys(
     algo.desired_kl algo.max_grad_norm algo.network.embedding_dim algo.network.init_std
     plan.generalist_env_steps plan.max_rounds
     evaluation.num_envs_per_robot evaluation.num_steps evaluation.physics_dt evaluation.decimation
-    run.torch_threads run.save_interval run.keep_checkpoints
+    run.save_interval run.keep_checkpoints
     """.split(),
     _POSITIVE,
 )

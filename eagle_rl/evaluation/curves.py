@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from eagle_rl.errors import ConfigError
 from eagle_rl.evaluation.evaluate import EvaluationResult
 
+STEPS = "Perf/env_steps"
 LEARNING_TAGS = {
     "reward per episode": "Train/mean_reward",
     "episode length [steps]": "Train/mean_episode_length",
@@ -19,6 +22,8 @@ LEARNING_TAGS = {
     r"$E_\omega$ [rad/s]": "Metrics/E_omega",
     "$E_h$ [m]": "Metrics/E_h",
     "$E_p$ [rad]": "Metrics/E_p",
+    "feet that match the clock [-]": "Metrics/contact_match",
+    "harness [share of full]": "Curriculum/harness",
     "$L_a$": "Distill/L_a",
     "$L_e$": "Distill/L_e",
 }
@@ -51,23 +56,40 @@ def read_curves(metrics: Path, smoothing: int = 1) -> dict[str, list[Curve]]:
     """The panels of LEARNING_TAGS for which a ``metrics.jsonl`` has numbers.
 
     Args:
-        metrics: file with one JSON object per iteration.
+        metrics: file with one JSON object per iteration, or what :func:`curves_to_csv` wrote.
         smoothing: iterations averaged into one point.
     """
     if not metrics.exists():
         raise ConfigError(f"{metrics}: no such file. Name a run or the folder of a stage that has begun to train.")
-    entries = [json.loads(line) for line in metrics.read_text(encoding="utf-8").splitlines() if line.endswith("}")]
+    lines = metrics.read_text(encoding="utf-8").splitlines()
+    if metrics.suffix == ".csv":
+        entries = [{key: value for key, value in row.items() if value} for row in csv.DictReader(lines)]
+    else:
+        entries = [json.loads(line) for line in lines if line.endswith("}")]
     panels = {title: list(_curves(entries, tag, smoothing)) for title, tag in LEARNING_TAGS.items()}
     return {title: curves for title, curves in panels.items() if curves}
+
+
+def curves_to_csv(panels: Mapping[str, Sequence[Curve]]) -> str:
+    """The numbers behind learning curves, one line per point, columns named as in a ``metrics.jsonl``."""
+    columns = {
+        f"{LEARNING_TAGS[title]}/{curve.robot}": dict(zip(curve.env_steps, curve.values, strict=True))
+        for title, curves in panels.items()
+        for curve in curves
+    }
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([STEPS, *columns])
+    for steps in sorted({steps for points in columns.values() for steps in points}):
+        writer.writerow([steps, *(f"{points[steps]:.5g}" if steps in points else "" for points in columns.values())])
+    return text.getvalue()
 
 
 def _curves(entries: Sequence[dict[str, float | str]], tag: str, smoothing: int) -> Iterator[Curve]:
     """One curve per robot that has the tag."""
     keys = dict.fromkeys(key for entry in entries for key in entry if key.startswith(f"{tag}/"))
     for key in keys:
-        points = [
-            (int(e["Perf/env_steps"]), float(e[key])) for e in entries if key in e and math.isfinite(float(e[key]))
-        ]
+        points = [(int(e[STEPS]), float(e[key])) for e in entries if key in e and math.isfinite(float(e[key]))]
         windows = [points[i : i + smoothing] for i in range(0, len(points), smoothing)]
         if windows:
             yield Curve(

@@ -100,25 +100,36 @@ def latent_maps(maps: Mapping[str, tuple[Embeddings, NDArray[np.float32], float,
         for i, robot in enumerate(embeddings.robots):
             own = points[embeddings.robot == i]
             ax.scatter(own[:, 0], own[:, 1], s=8, color=colours[robot], marker=MARKERS[i % 7], label=robot)
-        ax.set_title(f"{title}\nsilhouette {silhouette:.2f}, linear probe {accuracy:.0%}", fontsize=10)
+        ax.set_title(f"{title}\nsilhouette {silhouette:.2f}, linear probe {accuracy:.1%}", fontsize=10)
         ax.set_xticks([])
         ax.set_yticks([])
-    _legend(figure, axes.flat[0], len(COLOURS))
+        ax.spines[:].set_visible(False)
+    _legend(figure, axes.flat[0], 3 * len(maps))
     return figure
 
 
 def responses(all_responses: Sequence[Response]) -> Figure:
-    """Commanded (dashed) and measured traces: one row per robot, one column per command."""
-    figure, axes = _panels(len(all_responses), len(TRACES), width=2.6, height=1.8)
+    """Commanded (dashed) and measured traces: one row per robot, one column per command; a cross marks a fall."""
+    figure, axes = _panels(len(all_responses), len(TRACES), width=2.1, height=1.5)
+    axes[0, 0].plot([], [], "x", color=COLOURS[1], label="fall")
     for row, response in zip(axes, all_responses, strict=True):
         for d, ax in enumerate(row):
-            ax.plot(response.time, response.commanded[:, d], "--", color="0.3", linewidth=1, label="commanded")
-            ax.plot(response.time, response.measured[:, d], color=COLOURS[0], linewidth=1, label="measured")
+            commanded, measured = response.commanded[:, d], response.measured[:, d]
+            low, high = commanded.min(), commanded.max()
+            margin = 0.4 * (high - low)
+            ax.set_ylim(low - margin, high + margin)
+            ax.plot(response.time, commanded, "--", color="0.3", linewidth=1, label="commanded")
+            ax.plot(response.time, measured, color=COLOURS[0], linewidth=1, label="measured")
+            fallen = np.isnan(measured)
+            if fallen.any():
+                last = max(0, int(fallen.argmax()) - 1)
+                level = np.clip(np.nan_to_num(measured[last]), low - 0.9 * margin, high + 0.9 * margin)
+                ax.plot(response.time[last], level, "x", color=COLOURS[1])
         row[0].set_ylabel(response.robot, fontsize=10)
     for d, title in enumerate(TRACES):
         axes[0, d].set_title(title, fontsize=10)
         axes[-1, d].set_xlabel("time [s]", fontsize=9)
-    _legend(figure, axes[0, 0], 2)
+    _legend(figure, axes[0, 0], 3)
     return figure
 
 

@@ -133,12 +133,22 @@ def load_actor(
     return actor.to(device).eval(), manifest
 
 
-def publish_policy(path: Path, target: Path) -> Path:
-    """Write the policy of a checkpoint as safetensors and return the path of the file."""
+def publish_policy(path: Path, target: Path, env_steps: int | None = None) -> Path:
+    """Write the policy of a checkpoint as safetensors, for readers its manifest beside it; return the former's path.
+
+    Args:
+        path: the checkpoint.
+        target: where to, without suffix.
+        env_steps: what the policy has cost, if that is more than its own stage.
+    """
     checkpoint = load_checkpoint(path)
     target = target.with_suffix(published.SUFFIX)
     weights = checkpoint.state["algorithm"]["actor_state_dict"]
-    published.write_published(target, weights, checkpoint.state["architecture"], checkpoint.manifest)
+    manifest = checkpoint.manifest | ({} if env_steps is None else {"env_steps": env_steps})
+    published.write_published(target, weights, checkpoint.state["architecture"], manifest)
+    data = target.read_bytes()
+    about = {"file": target.name, "bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+    write_atomically(target.with_suffix(".json"), _encode_manifest({"published": about, "policy": manifest}))
     return target
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -11,6 +12,8 @@ from torch import Tensor
 
 from eagle_rl.errors import HealthError
 
+MAX_MAGNITUDE = 1e6
+"""Largest number an environment may hand over, in any observation or reward [-]; sound ones stay below 1e3."""
 SICK_LIMIT = 1e-3
 """Most environment steps of a robot that may end in sickness, as a share [-]."""
 SICK_WINDOW = 10
@@ -19,24 +22,27 @@ SICK_MINIMUM = 10
 """Sick environments below which the share says nothing: in a small pool one is already above the limit."""
 
 
-def require_finite(tensors: Mapping[str, Tensor], robot: Tensor, robot_names: Sequence[str]) -> None:
-    """Raise :class:`HealthError` naming the tensor, the robots and the environments if a number is not finite.
+def require_sound(tensors: Mapping[str, Tensor], robot: Tensor, robot_names: Sequence[str]) -> None:
+    """Raise :class:`HealthError` if a number is not finite or is absurd, naming tensor, robots and environments.
 
     Args:
         tensors: float tensors by name, rows are environments.
         robot: index of each environment's robot, shape (N,).
         robot_names: names of the robots.
     """
-    if torch.isfinite(torch.stack([tensor.sum() for tensor in tensors.values()]).sum()):
+    largest = torch.stack(torch._foreach_norm(list(tensors.values()), float("inf")))  # one pass; NaN stays NaN
+    if (largest <= MAX_MAGNITUDE).all():
         return
     for name, tensor in tensors.items():
-        bad = (~torch.isfinite(tensor).reshape(len(tensor), -1).all(dim=1)).nonzero().flatten()
+        wrong = ~(tensor.reshape(len(tensor), -1).abs() <= MAX_MAGNITUDE)
+        bad = wrong.any(dim=1).nonzero().flatten()
         if len(bad):
             names = sorted({robot_names[i] for i in robot[bad].tolist()})
-            value = tensor[bad[0]].reshape(-1)
-            column = int((~torch.isfinite(value)).nonzero()[0])
+            column = int(wrong[bad[0]].nonzero()[0])
+            value = tensor[bad[0]].reshape(-1)[column].item()
+            fault = "absurd" if math.isfinite(value) else "not finite"
             raise HealthError(
-                f"{name} is not finite: {value[column].item()} in column {column}; robots {', '.join(names)}; "
+                f"{name} is {fault}: {value} in column {column}; robots {', '.join(names)}; "
                 f"environments {bad[:16].tolist()}{' ...' if len(bad) > 16 else ''}. "
                 "The environment let an unsound state through; look at Health/* of the last iterations."
             )

@@ -21,7 +21,8 @@ def find_checkpoint(path: Path) -> Path:
         CheckpointError: there is none.
     """
     if path.suffix in (".pt", ".json", SUFFIX):
-        return path if path.suffix == SUFFIX else path.with_suffix(".pt")
+        published = path.with_suffix(SUFFIX)
+        return published if path.suffix == SUFFIX or published.exists() else path.with_suffix(".pt")
     folders = [path, path / "checkpoints"]
     if (path / "plan.json").exists():
         generalists = [stage.name for stage in read_plan(path) if not stage.specialised]

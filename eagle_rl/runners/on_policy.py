@@ -22,11 +22,11 @@ from eagle_rl.errors import CheckpointError, HealthError, Interrupted
 from eagle_rl.models import EagleActor
 from eagle_rl.models.actor import ACTOR_INPUTS
 from eagle_rl.runners import checkpoint as ckpt
-from eagle_rl.runners.health import SickRule, require_finite
+from eagle_rl.runners.health import SickRule, require_sound
 from eagle_rl.runners.interrupt import InterruptGuard
 from eagle_rl.runners.progress import ProgressReport
 from eagle_rl.runners.provenance import Provenance
-from eagle_rl.runners.team import join_processes
+from eagle_rl.runners.team import join_processes, over_processes
 from eagle_rl.runners.training_log import TrainingLog
 
 
@@ -81,6 +81,7 @@ class EagleRunner(OnPolicyRunner):
             super().__init__(env, train_cfg, None, device)
         if self.is_distributed:
             self.alg.broadcast_parameters()
+            env.over_processes = over_processes
         torch.manual_seed(train_cfg["seed"] + self.gpu_global_rank)
         self.provenance = provenance or Provenance()
         self.folder = Path(log_dir) if log_dir is not None and self.gpu_global_rank == 0 else None
@@ -182,7 +183,7 @@ class EagleRunner(OnPolicyRunner):
         obs, rewards, dones, extras = self.env.step(actions.to(self.env.device))
         self._obs, rewards, dones = obs.to(self.device), rewards.to(self.device), dones.to(self.device)
         tensors = {name: x for name, x in self._obs.items() if x.is_floating_point()} | {"rewards": rewards}
-        require_finite(tensors, self.robot, self.env.robot_names)
+        require_sound(tensors, self.robot, self.env.robot_names)
         self.alg.process_env_step(self._obs, rewards, dones, extras)
         self.logger.add_step(rewards, dones, extras)
 

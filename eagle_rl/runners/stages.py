@@ -71,7 +71,7 @@ def run_experiment(
     provenance = dataclasses.replace(provenance or Provenance(), config=dataclasses.asdict(cfg))
     stages = plan_stages(cfg, team.size)
     team.agree(lambda: open_plan(run_dir, provenance, stages, resume=resume, allow_drift=allow_drift))
-    worker = Worker(cfg, stages, run_dir, make_env, provenance, team, allow_drift)
+    worker = Worker(cfg, stages, run_dir, make_env, provenance, team, allow_drift, jobs)
     spawn = multiprocessing.get_context("spawn")
     helpers = [spawn.Process(target=_help, args=(worker,)) for _ in range(jobs - 1)]
     for helper in helpers:

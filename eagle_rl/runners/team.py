@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from datetime import timedelta
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import torch
 
@@ -26,6 +26,14 @@ def join_processes(device: str | torch.device) -> None:
     on_gpu = torch.device(device).type == "cuda"
     own_gpu = on_gpu and torch.cuda.device_count() >= int(os.getenv("LOCAL_WORLD_SIZE", "1"))
     torch.distributed.init_process_group("nccl" if own_gpu else "gloo")
+
+
+def over_processes(x: torch.Tensor, how: Literal["mean", "max"]) -> torch.Tensor:
+    """Mean or maximum of a tensor over all processes; every process must ask."""
+    pooled = x.clone()
+    operation = torch.distributed.ReduceOp.MAX if how == "max" else torch.distributed.ReduceOp.SUM
+    torch.distributed.all_reduce(pooled, operation)
+    return pooled if how == "max" else pooled / torch.distributed.get_world_size()
 
 
 class Team:

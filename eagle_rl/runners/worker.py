@@ -12,6 +12,7 @@ from rich.console import Console
 from eagle_rl.config.schema import ExperimentCfg
 from eagle_rl.evaluation.evaluate import EvaluationResult, evaluate
 from eagle_rl.evaluation.report import pooled_score
+from eagle_rl.machine import own_cores
 from eagle_rl.models.precision import set_up_torch
 from eagle_rl.runners.checkpoint import load_checkpoint, read_manifest
 from eagle_rl.runners.claims import Claim, ClaimLostError
@@ -39,14 +40,15 @@ class Worker:
         provenance: Provenance,
         team: Team,
         allow_drift: bool,
+        jobs: int = 1,
     ) -> None:
         """Work on the run in ``run_dir``; see ``run_experiment``."""
         self.cfg, self.stages, self.run_dir, self.make_env = cfg, stages, run_dir, make_env
-        self.provenance, self.team, self.allow_drift = provenance, team, allow_drift
+        self.provenance, self.team, self.allow_drift, self.jobs = provenance, team, allow_drift, jobs
 
     def work(self, console: Console | None = None) -> None:
         """Claim and run stages as they become ready."""
-        set_up_torch(self.cfg.run.torch_threads)
+        set_up_torch(self.cfg.run.torch_threads or own_cores(self.jobs))
         while True:
             claimed = self._claim() if self.team.leads else None
             name = self.team.agree(lambda: claimed and claimed[0].name)  # noqa: B023 (called at once)

@@ -18,6 +18,8 @@ from ..robots.spec import Array, RobotSpec
 
 LANE_WIDTH = 1.25
 """Distance between neighbouring robots [m]."""
+MARGIN = 0.7 * LANE_WIDTH
+"""From the middle of the outermost robot to the edge of the picture [m]."""
 
 _SKY_TOP, _SKY_BOTTOM = (0.55, 0.70, 0.88), (0.93, 0.96, 0.99)
 _TILE_LIGHT, _TILE_DARK = (0.80, 0.83, 0.86), (0.66, 0.71, 0.76)
@@ -91,7 +93,7 @@ class Stage:
 
 
 class FollowCamera:
-    """Points a MuJoCo camera at the robots and glides after their middle."""
+    """Points a MuJoCo camera at the robots, glides after their middle and steps back when they part."""
 
     def __init__(
         self, camera: mujoco.MjvCamera, num_robots: int, aspect: float, fovy_deg: float, cfg: CameraCfg | None = None
@@ -100,7 +102,10 @@ class FollowCamera:
         cfg = cfg or CameraCfg()
         self.camera = camera
         camera.azimuth, camera.elevation = cfg.azimuth_deg, cfg.elevation_deg
-        camera.distance = cfg.margin * _distance(num_robots, aspect, fovy_deg)
+        self._least = camera.distance = cfg.margin * _distance(num_robots, aspect, fovy_deg)
+        azimuth = np.radians(cfg.azimuth_deg)
+        self._forward = np.array([np.cos(azimuth), np.sin(azimuth)])
+        self._half_width = aspect * float(np.tan(0.5 * np.radians(fovy_deg)))
         self._height = cfg.height
         self._centre: Array | None = None
 
@@ -109,6 +114,14 @@ class FollowCamera:
         target = roots[:, :2].mean(axis=0)
         self._centre = target if self._centre is None else smoothing * self._centre + (1 - smoothing) * target
         self.camera.lookat = [*self._centre, self._height]
+        needed = max(self._least, self._needed(roots[:, :2] - self._centre))
+        self.camera.distance = smoothing * self.camera.distance + (1 - smoothing) * needed
+
+    def _needed(self, offsets: Array) -> float:
+        """Distance from which robots with these horizontal offsets from the point looked at are all in view [m]."""
+        depth = offsets @ self._forward
+        across = np.abs(offsets @ np.array([-self._forward[1], self._forward[0]])) + MARGIN
+        return float((across / self._half_width - depth).max())
 
 
 def default_qpos(spec: RobotSpec) -> Array:
@@ -124,7 +137,7 @@ def lanes(num_robots: int) -> Array:
 def _distance(num_robots: int, aspect: float, fovy_deg: float) -> float:
     """Distance at which both the line of robots and a robot's height fit into the view [m]."""
     half_height = np.tan(0.5 * np.radians(fovy_deg))
-    across = 0.5 * LANE_WIDTH * (num_robots + 0.4) / (half_height * aspect)
+    across = (0.5 * LANE_WIDTH * (num_robots - 1) + MARGIN) / (half_height * aspect)
     return float(max(across, 1.1 / half_height))
 
 

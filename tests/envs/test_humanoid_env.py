@@ -218,3 +218,18 @@ def test_commands_are_redrawn_at_the_interval() -> None:
     commands = [env.command, *(env.command for _ in rollout(env, 12, scale=0.0))]
     redrawn = [i for i in range(1, 13) if not torch.equal(commands[i], commands[i - 1])]
     assert redrawn == [5, 10]
+
+
+def test_the_curriculum_goes_by_what_all_processes_saw() -> None:
+    """Another process falls all the time and never steps, but has opened every command."""
+    alone, together = make_env(), make_env()
+    others = {"mean": lambda x: torch.tensor([[1.0], [0.0]]).expand_as(x), "max": torch.ones_like}
+    together.over_processes = lambda x, how: others[how](x)
+    for env in (alone, together):
+        for _ in rollout(env, LOG_INTERVAL):
+            pass
+    assert not (alone.commands.sampler.weights > 0).all()
+    assert (together.commands.sampler.weights == 1).all()
+    state = together.aids.state_dict()
+    assert (state["_episode_ratio"] < alone.aids.state_dict()["_episode_ratio"]).all()
+    assert not state["_contact_match"].any()

@@ -13,7 +13,7 @@ from tensordict import TensorDict
 from eagle_rl.config.schema import CommandsCfg, EvaluationCfg, TaskCfg
 from eagle_rl.errors import ConfigError
 from eagle_rl.evaluation import latents, plots
-from eagle_rl.evaluation.curves import RoundScores, read_curves, read_rounds
+from eagle_rl.evaluation.curves import RoundScores, curves_to_csv, read_curves, read_rounds
 from eagle_rl.evaluation.evaluate import EvaluationResult, evaluate
 from eagle_rl.evaluation.latents import Embeddings
 from eagle_rl.evaluation.response import command_responses, script
@@ -129,6 +129,16 @@ def test_curves_are_read_per_robot_and_smoothed(tmp_path):
     assert (curve.robot, curve.env_steps, curve.values) == ("h1", (20, 40), (1.5, 3.5))
 
 
+def test_curves_survive_their_csv(tmp_path):
+    metrics, table = tmp_path / "metrics.jsonl", tmp_path / "curves.csv"
+    rows = [{"Perf/env_steps": 10 * i, "Metrics/E_vx/h1": i / 8, "Curriculum/harness/h1": 1.0} for i in range(1, 5)]
+    rows[2]["Metrics/E_vx/g1"] = 0.5
+    metrics.write_text("\n".join(map(json.dumps, rows)))
+    panels = read_curves(metrics)
+    table.write_text(curves_to_csv(panels))
+    assert read_curves(table) == panels
+
+
 def judged(tmp_path, name: str, robots: list[str]):
     ev = EvaluationCfg(num_envs_per_robot=5, num_steps=1)
     metrics = evaluate(idle, make_scripted_env, robots, TaskCfg(), ev)
@@ -158,7 +168,7 @@ def test_figures_are_written_as_png_and_pdf(tmp_path):
         "rounds": plots.error_rounds([score]),
         "robustness": plots.robustness([(SWEEPS["push"], swept)]),
     }
-    assert "silhouette 0.50, linear probe 90%" in figures["latents"].axes[0].get_title()
+    assert "silhouette 0.50, linear probe 90.0%" in figures["latents"].axes[0].get_title()
     for name, figure in figures.items():
         for path in plots.save(figure, tmp_path, name):
             assert path.stat().st_size > 1000

@@ -248,6 +248,9 @@ def test_a_published_policy_is_the_checkpoint_s_and_any_flipped_byte_is_refused(
     with torch.no_grad():
         assert torch.equal(actor(obs), runner.alg.actor(obs))
     assert manifest == ckpt.read_manifest(checkpoint)
+    told = json.loads(path.with_suffix(".json").read_text())
+    assert told["policy"] == manifest
+    assert told["published"]["sha256"] == hashlib.sha256(path.read_bytes()).hexdigest()
     with pytest.raises(CheckpointError, match="another slot table"):
         ckpt.load_actor(path, slot_table_hash="other")
     whole, rng = path.read_bytes(), random.Random(1)

@@ -17,7 +17,7 @@ from rich.console import Console
 from eagle_rl.config.schema import RunCfg
 from eagle_rl.errors import CheckpointError, HealthError, Interrupted
 from eagle_rl.runners import checkpoint as ckpt
-from eagle_rl.runners.health import require_finite
+from eagle_rl.runners.health import require_sound
 from eagle_rl.runners.on_policy import EagleRunner
 from eagle_rl.runners.progress import ProgressReport
 from eagle_rl.runners.provenance import Provenance
@@ -258,15 +258,16 @@ def test_warnings_are_repeated_once_a_minute_at_most():
     assert len(caught) == 3
 
 
-@pytest.mark.parametrize("poison", [math.nan, math.inf, -math.inf])
-def test_what_is_not_finite_is_named_with_its_robot_and_environments(poison):
+@pytest.mark.parametrize("poison", [math.nan, math.inf, -math.inf, 1e12, -1e12])
+def test_what_is_not_finite_or_absurd_is_named_with_its_robot_and_environments(poison):
     robot = torch.tensor([0, 0, 1, 1])
     tensors = {"history": torch.zeros(4, 7), "rewards": torch.zeros(4)}
-    require_finite(tensors, robot, ["h1", "g1"])
+    require_sound(tensors, robot, ["h1", "g1"])
     tensors["history"][2:, 5] = poison
-    expected = rf"history is not finite: {poison} in column 5; robots g1; environments \[2, 3\]"
+    fault, value = ("absurd", tensors["history"][2, 5].item()) if math.isfinite(poison) else ("not finite", poison)
+    expected = rf"history is {fault}: {value} in column 5; robots g1; environments \[2, 3\]"
     with pytest.raises(HealthError, match=expected):
-        require_finite(tensors, robot, ["h1", "g1"])
+        require_sound(tensors, robot, ["h1", "g1"])
 
 
 @pytest.mark.parametrize("where", ["rewards", "critic"])

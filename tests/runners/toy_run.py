@@ -63,7 +63,7 @@ def toy_experiment(iterations: int = 3, judge_envs: int = 4, **plan: object) -> 
         algo=AlgoCfg(num_steps_per_env=STEPS, num_learning_epochs=1, num_mini_batches=2, network=NETWORK),
         plan=PlanCfg(**{"method": "eagle", "judge_envs_per_robot": judge_envs, **budgets, **plan}),  # type: ignore[arg-type]
         evaluation=EvaluationCfg(num_steps=5),
-        run=RunCfg(save_interval=1),
+        run=RunCfg(save_interval=1, torch_threads=1),  # forked processes cannot use threads of their parent
     )
 
 
