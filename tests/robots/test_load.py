@@ -22,7 +22,7 @@ from envs.robots.model import build_model
 
 from .biped import NOMINAL_HEIGHT, SOLE_Z, biped_data, biped_urdf, write_biped
 
-fuzz = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+fuzz = settings(max_examples=250, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 def _refusal(folder: Path, urdf: str | None = None, data: object = None) -> str:
