@@ -168,7 +168,7 @@ def test_figures_are_written_as_png_and_pdf(tmp_path):
         "rounds": plots.error_rounds([score]),
         "robustness": plots.robustness([(SWEEPS["push"], swept)]),
     }
-    assert "silhouette 0.50, linear probe 90%" in figures["latents"].axes[0].get_title()
+    assert "silhouette 0.50, linear probe 90.0%" in figures["latents"].axes[0].get_title()
     for name, figure in figures.items():
         for path in plots.save(figure, tmp_path, name):
             assert path.stat().st_size > 1000

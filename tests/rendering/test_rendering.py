@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import imageio_ffmpeg
+import mujoco
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from eagle_rl.errors import ConfigError
 from envs.rendering import offscreen
 from envs.rendering.offscreen import OffscreenRenderer, RenderingError, gl_backends, open_context
 from envs.rendering.recorder import captioned, contact_sheet, evenly, save_picture, video_writer
-from envs.rendering.scene import LANE_WIDTH, Stage, default_qpos
+from envs.rendering.scene import LANE_WIDTH, FollowCamera, Stage, default_qpos
 from envs.robots.load import load_robot
 
 needs_gl = pytest.mark.skipif(not gl_backends(), reason="this machine has no EGL and no OSMesa")
@@ -129,3 +132,18 @@ def test_a_caption_changes_only_the_top_of_a_frame():
 def test_frames_for_a_sheet_are_spread_from_first_to_last():
     assert evenly(101, 5) == [0, 25, 50, 75, 100]
     assert evenly(2, 12) == [0, 1]
+
+
+@given(st.lists(st.tuples(st.floats(-4, 4), st.floats(-4, 4)), min_size=1, max_size=5))
+def test_the_camera_steps_back_until_robots_that_part_are_in_view(places):
+    camera, aspect, fovy = mujoco.MjvCamera(), 16 / 9, 30.0
+    follow = FollowCamera(camera, len(places), aspect, fovy)
+    roots = np.array([(x, y, 1.0) for x, y in places])
+    for _ in range(500):
+        follow.follow(roots)
+    azimuth = np.radians(camera.azimuth)
+    forward, left = np.array([np.cos(azimuth), np.sin(azimuth)]), np.array([-np.sin(azimuth), np.cos(azimuth)])
+    offsets = roots[:, :2] - camera.lookat[:2]
+    depth = camera.distance + offsets @ forward
+    assert (depth > 0).all()
+    assert (np.abs(offsets @ left) < depth * aspect * np.tan(np.radians(fovy) / 2)).all()
