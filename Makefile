@@ -5,6 +5,7 @@
 #   make test      all tests            make check     format, lint, types
 #   make results   tables and figures of docs/results from the published policy (a quarter of an hour on two cores)
 #   make bench     throughput           make package   sdist and wheel, installed and tried in an empty folder
+#   make mutants   break the mathematics in 55 places, one at a time: do the tests notice? (about ten minutes)
 #   make clean     remove what was built (never logs/)
 #
 # PYTHON names the interpreter (3.10 to 3.13). CONSTRAINTS= installs the newest allowed packages instead of the tested
@@ -21,7 +22,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 INSTALLED := $(VENV)/.installed
 
-.PHONY: setup train play test check results bench package clean help
+.PHONY: setup train play test check results bench mutants package clean help
 
 help:
 	@sed -n 's/^# \{0,1\}//p' Makefile
@@ -64,6 +65,9 @@ results: $(INSTALLED)
 
 bench: $(INSTALLED)
 	$(BIN)/eagle bench
+
+mutants: $(INSTALLED)
+	$(BIN)/python -m tests.mutants
 
 package: $(INSTALLED)
 	rm -rf dist build

@@ -42,12 +42,12 @@ class ProgressReport:
 
     def update(self, iteration: int, env_steps: int, scalars: Mapping[str, float]) -> None:
         """Report a finished iteration."""
-        reward = scalars.get("Train/mean_reward", float("nan"))
-        length = scalars.get("Train/mean_episode_length", float("nan"))
-        text = (
-            f"{self._title} {iteration}/{self._last} | {env_steps / 1e6:.2f}M steps "
-            f"| {scalars['Perf/total_fps']:.0f}/s | reward {reward:.2f} | length {length:.0f}"
-        )
+        episodes = "no episode over yet"
+        if "Train/mean_reward" in scalars:
+            reward, length = scalars["Train/mean_reward"], scalars["Train/mean_episode_length"]
+            episodes = f"reward {reward:.2f} | length {length:.0f}"
+        speed = f"{env_steps / 1e6:.2f}M steps | {scalars['Perf/total_fps']:.0f}/s"
+        text = f"{self._title} {iteration}/{self._last} | {speed} | {episodes}"
         if self._bar is not None:
             self._bar.update(self._task, completed=iteration, description=text)
         elif time.monotonic() - self._last_line >= LINE_INTERVAL_S or iteration == self._last:

@@ -25,6 +25,14 @@ def test_estimation_loss_weighs_velocity_and_embodiment_by_their_own_means():
     assert losses.estimation_loss(target + error, target).item() == pytest.approx(4 + 9, rel=1e-5)
 
 
+@pytest.mark.parametrize("column", range(33))
+def test_every_column_of_the_estimate_counts_once(column):
+    error = torch.zeros(4, 33)
+    error[:, column] = 3.0
+    dims = 3 if column < 3 else 30
+    assert losses.estimation_loss(error, torch.zeros(4, 33)).item() == pytest.approx(9 / dims)
+
+
 def test_estimation_loss_without_embodiment_is_that_of_the_velocity():
     assert losses.estimation_loss(torch.ones(4, 3), torch.zeros(4, 3)).item() == pytest.approx(1.0)
 

@@ -329,7 +329,9 @@ def test_progress_draws_a_bar_on_a_terminal(capsys):
     console = Console(force_terminal=True, width=200)
     with ProgressReport("ppo", 0, 1, console) as progress:
         progress.update(1, 1, {"Perf/total_fps": 1.0})
-    assert "ppo 1/1" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "ppo 1/1" in out
+    assert "no episode over yet" in out
 
 
 PROCESS = """

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from eagle_rl.config.schema import ObservationsCfg
 from envs.geometry import rotate_inverse
+from envs.mdp.layout import ObservationLayout
 from envs.mdp.symmetry import mirror_robots, mirror_state
 from envs.robots.slots import SLOT_INDEX
 from envs.robots.spec import COLLISION_LINKS
@@ -48,6 +49,17 @@ def test_mirrored_orientation_agrees_with_mirrored_vectors() -> None:
     assert torch.allclose(mirrored.heading_w, state.heading_w * torch.tensor([1.0, -1.0]))
     assert torch.allclose(mirrored.base_roll, -state.base_roll)
     assert torch.allclose(mirrored.base_pitch, state.base_pitch)
+
+
+def test_the_cross_product_of_mirrored_vectors_is_the_mirrored_angular_velocity() -> None:
+    """Velocities flip along y, angular velocities along x and z: a turn to the left becomes one to the right."""
+    state = random_state(5, random_robots(5))
+    state.base_ang_vel_b = torch.linalg.cross(state.base_lin_vel_b, state.projected_gravity_b)
+    mirrored = mirror_state(state, CFG)
+    expected = torch.linalg.cross(mirrored.base_lin_vel_b, mirrored.projected_gravity_b)
+    assert torch.allclose(mirrored.base_ang_vel_b, expected)
+    sign = ObservationLayout(CFG).mirror()["history"][1]
+    assert sign[:3].tolist() == [-1.0, 1.0, -1.0]
 
 
 def test_limbs_and_links_change_sides() -> None:

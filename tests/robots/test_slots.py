@@ -35,6 +35,19 @@ NUM_JOINTS = {"h1": 19, "g1": 29, "t1": 23, "n1": 23, "adam": 25}
 robots = pytest.mark.parametrize("name", ROBOTS)
 
 
+LEGS = "hip_pitch hip_roll hip_yaw knee_pitch ankle_pitch ankle_roll".split()
+ARMS = "shoulder_pitch shoulder_roll shoulder_yaw elbow_pitch wrist_roll wrist_pitch wrist_yaw".split()
+
+
+def test_slots_lie_as_in_the_paper_right_before_left() -> None:
+    """Checkpoints and exports depend on this order."""
+    assert [name.removeprefix("right_") for name in SLOT_NAMES[0:12:2]] == LEGS
+    assert [name.removeprefix("left_") for name in SLOT_NAMES[1:12:2]] == LEGS
+    assert SLOT_NAMES[12:18] == tuple(f"{part}_{axis}" for part in ("waist", "head") for axis in AXES)
+    assert [name.removeprefix("right_") for name in SLOT_NAMES[18::2]] == ARMS
+    assert [name.removeprefix("left_") for name in SLOT_NAMES[19::2]] == ARMS
+
+
 @robots
 def test_selection_undoes_permutation(name: str) -> None:
     spec = shipped(name)

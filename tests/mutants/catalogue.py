@@ -1,0 +1,178 @@
+"""Mistakes in the mathematics, each one that a tired author could make: signs, indices, slots, coefficients, masks.
+
+A mutant replaces ``old``, which occurs once in its file, by ``new``; one of its ``tests`` must then fail.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+
+class Mutant(NamedTuple):
+    """One mistake."""
+
+    file: str
+    old: str
+    new: str
+    tests: str
+    """Test files under ``tests``, separated by blanks."""
+
+
+REWARDS = "envs/mdp/rewards.py"
+GAIT = "envs/mdp/gait.py"
+OBSERVATIONS = "envs/mdp/observations.py"
+LAYOUT = "envs/mdp/layout.py"
+COMMANDS = "envs/mdp/commands.py"
+GEOMETRY = "envs/geometry.py"
+SLOTS = "envs/robots/slots.py"
+EMBODIMENT = "envs/robots/embodiment.py"
+POOLING = "envs/pooling.py"
+AIDS = "envs/mdp/aids.py"
+LOSSES = "eagle_rl/algorithms/losses.py"
+GAUSSIAN = "eagle_rl/models/distribution.py"
+PPO = "eagle_rl/algorithms/eagle_ppo.py"
+AUXILIARY = "eagle_rl/algorithms/auxiliary.py"
+
+REWARD_TESTS = "mdp/test_rewards.py"
+LEARNER_TESTS = "learner/test_eagle_ppo.py"
+STATE_TESTS = "envs/test_measure.py"
+
+MUTANTS: tuple[Mutant, ...] = (
+    # rewards
+    Mutant(REWARDS, "exp(squared_error / -kappa)", "exp(squared_error / -(kappa * kappa))", REWARD_TESTS),
+    Mutant(REWARDS, "command[:, :2] - state.base_lin_vel_b", "command[:, :2] + state.base_lin_vel_b", REWARD_TESTS),
+    Mutant(REWARDS, "- state.base_ang_vel_b[:, 2])", "- state.base_ang_vel_b[:, 1])", REWARD_TESTS),
+    Mutant(REWARDS, "nominal_height + state.command[:, 3]", "nominal_height - state.command[:, 3]", REWARD_TESTS),
+    Mutant(REWARDS, "state.command[:, 4] - state.base_pitch", "state.command[:, 4] + state.base_pitch", REWARD_TESTS),
+    Mutant(REWARDS, "swing = 1.0 - ctx.once(", "swing = ctx.once(", REWARD_TESTS),
+    Mutant(REWARDS, "_square_sum(state.foot_force_w)", "_square_sum(state.foot_force_w[..., :2])", REWARD_TESTS),
+    Mutant(REWARDS, "state.foot_contact | state.last", "state.foot_contact & state.last", REWARD_TESTS),
+    Mutant(
+        REWARDS, "_square_sum(state.base_ang_vel_b[:, :2])", "_square_sum(state.base_ang_vel_b[:, 1:])", REWARD_TESTS
+    ),
+    Mutant(REWARDS, "alpha=-2.0", "alpha=-1.0", REWARD_TESTS),
+    Mutant(REWARDS, "gravity_x - torch.sin", "gravity_x + torch.sin", REWARD_TESTS),
+    Mutant(REWARDS, "* step_dt * (penalty_scale if", "* (penalty_scale if", REWARD_TESTS),
+    Mutant(REWARDS, "1.0 - 0.5 * _swing_load", "1.0 - _swing_load", REWARD_TESTS),
+    Mutant(
+        "envs/mdp/curriculum.py", "penalty_exponent**updates", "penalty_exponent * updates", "mdp/test_curriculum.py"
+    ),
+    # gait
+    Mutant(
+        GAIT,
+        "(torch.remainder(phase + cfg.phase_offset, 1.0), phase)",
+        "(phase, torch.remainder(phase + cfg.phase_offset, 1.0))",
+        "mdp/test_gait.py",
+    ),
+    Mutant(GAIT, "(0.0, 0.5, 1.0, 1.5)", "(0.0, 0.5, 0.9, 1.5)", "mdp/test_gait.py"),
+    Mutant(GAIT, "6.0 * rise - 15.0", "6.0 * rise - 14.0", "mdp/test_gait.py"),
+    Mutant(GAIT, "STANDING_PHASE = 0.25", "STANDING_PHASE = 0.75", "mdp/test_gait.py"),
+    # frames and the pooled state
+    Mutant(GEOMETRY, "vector - w * t", "vector + w * t", STATE_TESTS),
+    Mutant(GEOMETRY, "torch.addcmul(c * y, s, x, value=-1.0)", "torch.addcmul(c * y, s, x)", STATE_TESTS),
+    Mutant(GEOMETRY, "torch.addcmul(w * z, x, y)", "torch.addcmul(w * z, x, y, value=-1.0)", STATE_TESTS),
+    Mutant("envs/measure.py", "(0.0, 0.0, -1.0)", "(0.0, 0.0, 1.0)", STATE_TESTS),
+    Mutant(
+        "envs/state.py", "atan2(-self.projected_gravity_b[:, 1]", "atan2(self.projected_gravity_b[:, 1]", STATE_TESTS
+    ),
+    # slots and mirror
+    Mutant(SLOTS, '_SIDES = ("right", "left")', '_SIDES = ("left", "right")', "robots/test_slots.py"),
+    Mutant(SLOTS, 'name.endswith("_pitch") else', 'name.endswith("_roll") else', "robots/test_slots.py"),
+    Mutant(
+        LAYOUT,
+        "AXIAL = Mirror.keep(-1.0, 1.0, -1.0)",
+        "AXIAL = Mirror.keep(1.0, -1.0, 1.0)",
+        "mdp/test_symmetry.py",
+    ),
+    Mutant(LAYOUT, "1.0, 1.0, 1.0, -1.0, 1.0, -1.0)", "1.0, 1.0, 1.0, -1.0, -1.0, 1.0)", "robots/test_embodiment.py"),
+    Mutant(
+        "envs/robots/spec.py",
+        "self.signs * (joint_pos - self.zero",
+        "self.signs * (joint_pos + self.zero",
+        "robots/test_slots.py",
+    ),
+    Mutant(POOLING, "0.5 * ratio * (upper - lower)", "ratio * (upper - lower)", "envs/test_pooling.py"),
+    Mutant(POOLING, "spec.effort_limit / spec.stiffness", "spec.stiffness / spec.effort_limit", "envs/test_pooling.py"),
+    # observations
+    Mutant(
+        OBSERVATIONS, "state.joint_pos - robots.default", "state.joint_pos + robots.default", "mdp/test_observations.py"
+    ),
+    Mutant(OBSERVATIONS, "(2.0 / (high - low)) - 1.0", "(2.0 / (high - low))", "mdp/test_observations.py"),
+    Mutant(
+        OBSERVATIONS,
+        "torch.lerp(current[:, :SENSED_SIZE], previous[:, :SENSED_SIZE], fraction)",
+        "torch.lerp(previous[:, :SENSED_SIZE], current[:, :SENSED_SIZE], fraction)",
+        "mdp/test_observations.py",
+    ),
+    Mutant(
+        OBSERVATIONS,
+        "torch.cat((frame.unsqueeze(1), self.frames[:, :-1]), dim=1)",
+        "torch.cat((self.frames[:, 1:], frame.unsqueeze(1)), dim=1)",
+        "mdp/test_observations.py",
+    ),
+    Mutant(EMBODIMENT, "scale * length.square()", "scale * length", "robots/test_embodiment.py"),
+    Mutant(EMBODIMENT, "rows[[0, 2, 1]]", "rows[[0, 1, 2]]", "robots/test_embodiment.py"),
+    # commands, aids, errors
+    Mutant(COMMANDS, "mean > self._thresholds", "mean < self._thresholds", "mdp/test_commands.py"),
+    Mutant(COMMANDS, "wins @ self._grid.neighbours", "wins", "mdp/test_commands.py"),
+    Mutant(
+        COMMANDS,
+        "(planar[:, :1], others[:, :1], planar[:, 1:], others[:, 1:])",
+        "(planar[:, 1:], others[:, :1], planar[:, :1], others[:, 1:])",
+        "mdp/test_commands.py",
+    ),
+    Mutant(AIDS, "_HEIGHT_STIFFNESS * sag", "_HEIGHT_STIFFNESS * -sag", "mdp/test_aids.py"),
+    Mutant(
+        "envs/mdp/terminations.py",
+        "state.base_roll.abs() > cfg.max_roll",
+        "state.base_roll > cfg.max_roll",
+        "mdp/test_terminations.py",
+    ),
+    Mutant("envs/mdp/metrics.py", "state.base_height - robots", "state.base_height + robots", "mdp/test_metrics.py"),
+    Mutant(
+        "eagle_rl/evaluation/metrics.py",
+        "self.charge += counted + absent",
+        "self.charge += counted",
+        "evaluation/test_evaluate.py",
+    ),
+    # learner
+    Mutant(LOSSES, "* mask).sum() / mask.sum()", "* mask).mean()", "learner/test_losses.py"),
+    Mutant(LOSSES, "mean_of_mirrored[:, perm] * sign", "mean_of_mirrored[:, perm]", "learner/test_losses.py"),
+    Mutant(LOSSES, "(teacher_std / std).square()", "(std / teacher_std).square()", "learner/test_losses.py"),
+    Mutant(
+        LOSSES,
+        "error[:, BASE_VELOCITY_DIM:].mean()",
+        "error[:, BASE_VELOCITY_DIM + 1 :].mean()",
+        "learner/test_losses.py",
+    ),
+    Mutant(
+        GAUSSIAN,
+        "(self._distribution.log_prob(outputs) * self.mask)",
+        "(self._distribution.log_prob(outputs))",
+        "learner/test_distribution.py",
+    ),
+    Mutant(
+        GAUSSIAN,
+        "(self._distribution.entropy() * self.mask)",
+        "(self._distribution.entropy())",
+        "learner/test_distribution.py",
+    ),
+    Mutant(GAUSSIAN, "kl_divergence(old, new).sum", "kl_divergence(new, old).sum", "learner/test_distribution.py"),
+    Mutant(PPO, "self.gamma * final", "final", LEARNER_TESTS),
+    Mutant(
+        PPO, "self.learning_rate / LEARNING_RATE_FACTOR", "self.learning_rate * LEARNING_RATE_FACTOR", LEARNER_TESTS
+    ),
+    Mutant(PPO, "math.exp(-cfg.kickstart_decay", "math.exp(cfg.kickstart_decay", LEARNER_TESTS),
+    Mutant(
+        AUXILIARY,
+        "self.alpha * action + self.beta * embedding",
+        "self.beta * action + self.alpha * embedding",
+        LEARNER_TESTS,
+    ),
+    Mutant(
+        "eagle_rl/algorithms/specialists.py",
+        "enumerate(self.specialists)",
+        "enumerate(self.specialists[::-1])",
+        LEARNER_TESTS,
+    ),
+)
