@@ -61,7 +61,7 @@ results: $(INSTALLED)
 	$(BIN)/eagle plot latents $(POLICY).safetensors --out $(RESULTS)
 	$(BIN)/eagle plot curves root=$(RESULTS)/curves/curves_root.csv --smooth 1 --out $(RESULTS)/curves
 	$(BIN)/python play.py $(POLICY).safetensors --viewer none --contact-sheet $(RESULTS)/demo.png
-	for robot in h1 g1 t1 n1 adam; do $(BIN)/eagle sim2sim $(POLICY).onnx --robot $$robot; done > $(RESULTS)/sim2sim.txt
+	for robot in h1 g1 t1 n1 adam; do $(BIN)/eagle sim2sim $(POLICY).onnx --robot $$robot || exit 1; done > $(RESULTS)/sim2sim.txt
 
 bench: $(INSTALLED)
 	$(BIN)/eagle bench
