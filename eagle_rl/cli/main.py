@@ -29,12 +29,19 @@ VERBS: dict[str, str] = {
 
 INTERRUPTED = 130
 
+_FIRST = """first steps:
+  eagle doctor               is everything here?
+  eagle play                 watch the published policy, or your newest run
+  eagle train quickstart     train your own in minutes; eagle status RUN tells how far it is
+
+eagle VERB --help tells more."""
+
 
 def usage() -> str:
     """The text of ``eagle --help``."""
     verbs = "\n".join(f"  {verb:<10} {summary}" for verb, summary in VERBS.items())
     title = f"eagle {__version__}: one whole-body controller for many humanoids."
-    return f"{title}\n\nusage: eagle VERB ...\n\n{verbs}\n\neagle VERB --help tells more."
+    return f"{title}\n\nusage: eagle VERB ...\n\n{verbs}\n\n{_FIRST}"
 
 
 def guarded(action: Callable[[], int]) -> int:

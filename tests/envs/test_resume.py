@@ -10,18 +10,31 @@ from typing import Any
 import pytest
 import torch
 
-from eagle_rl.config.schema import AidsCfg, CommandsCfg, RandomizationCfg, TaskCfg, TerminationsCfg
+from eagle_rl.config.schema import (
+    AidsCfg,
+    CommandCurriculumCfg,
+    CommandsCfg,
+    RandomizationCfg,
+    RewardsCfg,
+    TaskCfg,
+    TerminationsCfg,
+)
 from envs.humanoid_env import HumanoidEnv
 from tests.envs.worlds import BARE, LOG_INTERVAL, actions, assert_same, make_env
 
+EASY = CommandCurriculumCfg(
+    lin_vel_threshold=0.0, ang_vel_threshold=0.0, contact_force_threshold=0.0, contact_vel_threshold=0.0
+)
+"""Any window that was not cut short widens the commands."""
 BUSY = replace(
     TaskCfg(),
-    commands=CommandsCfg(resampling_time_s=0.3),
+    commands=CommandsCfg(resampling_time_s=0.3, curriculum=EASY),
+    rewards=RewardsCfg(penalty_interval_steps=40),
     randomization=RandomizationCfg(push_interval_s=0.34),
     terminations=TerminationsCfg(episode_length_s=0.9),
     aids=AidsCfg(harness=0.1),
 )
-"""Pushes, resampling, time-outs and falls within a second."""
+"""Pushes, resampling, time-outs, falls and every curriculum within a second."""
 
 
 def run(env: HumanoidEnv, steps: range) -> list[Any]:
@@ -66,15 +79,18 @@ def flat(x: Any) -> Any:
     return x.tolist() if isinstance(x, torch.Tensor) else x
 
 
-@pytest.mark.parametrize("before", [1, 16, 17, 24, 37, 44, 45])
+@pytest.mark.parametrize("before", [1, 16, 17, 24, 40, 44, 45])
 def test_an_environment_resumes_bit_for_bit(before: int) -> None:
-    """In mid-episode, around pushes (17), log entries (24) and time-outs (45)."""
+    """In mid-episode, around pushes (17), log entries (24), a harder penalty (40) and time-outs (45)."""
     assert_continues(lambda: make_env(task=BUSY), before, 60)
 
 
 def test_everything_happened_that_the_resume_test_is_about() -> None:
     env = make_env(task=BUSY)
+    penalty, bins = env.penalty_scale, env.commands.sampler.weights.sum()
     outs = run(env, range(105))
+    assert env.penalty_scale > penalty
+    assert env.commands.sampler.weights.sum() > bins, "no window widened the commands"
     time_outs = sum(int(out[3]["time_outs"].sum()) for out in outs)
     falls = sum(int(out[2].sum()) for out in outs) - time_outs
     assert time_outs > 0
