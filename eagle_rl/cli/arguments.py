@@ -9,10 +9,15 @@ from pathlib import Path
 from eagle_rl.errors import ConfigError
 
 
+MAX_COUNT = 1_000_000
+
+
 def count(text: str) -> int:
     """A whole number above zero; a ``type`` for argparse."""
-    if not text.isdecimal() or int(text) == 0:
+    if not (text.isascii() and text.isdecimal() and int(text) > 0):
         raise argparse.ArgumentTypeError(f"got {text!r}, expected a whole number above 0")
+    if int(text) > MAX_COUNT:
+        raise argparse.ArgumentTypeError(f"got {text!r}, expected at most {MAX_COUNT}")
     return int(text)
 
 
