@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 MAX_TILT = 1.0
 """Inclination of the base beyond which the robot counts as fallen [rad]."""
+MAX_SUBSTEPS = 1000
+"""Physics steps per control step."""
 ERRORS = (("E_vx", "m/s"), ("E_vy", "m/s"), ("E_omega", "rad/s"), ("E_h", "m"), ("E_p", "rad"))
 
 
@@ -61,9 +63,9 @@ def main(argv: Sequence[str]) -> int:
     spec = load_robot(args.robot)
     policy = OnnxPolicy(args.policy, spec.name)
     substeps = round(policy.contract.step_dt / args.physics_dt) if args.physics_dt > 0 else 0
-    if substeps < 1 or abs(substeps * args.physics_dt - policy.contract.step_dt) > 1e-9:
+    if not 1 <= substeps <= MAX_SUBSTEPS or abs(substeps * args.physics_dt - policy.contract.step_dt) > 1e-9:
         step = policy.contract.step_dt
-        raise ConfigError(f"--physics-dt: got {args.physics_dt:g}, expected a whole fraction of {step:g} s.")
+        raise ConfigError(f"--physics-dt: got {args.physics_dt:g}, expected {step:g} s over 1 to {MAX_SUBSTEPS}.")
     outcome = simulate(policy, spec, script, substeps)
     fate = f"fell after {outcome.survived_s:.1f} s" if outcome.fell else f"stood for all of {outcome.survived_s:.1f} s"
     print(f"{spec.name}: {fate}, physics step {args.physics_dt:g} s")

@@ -148,6 +148,8 @@ def test_where_no_checkpoint_is_it_is_said_so(refused, verb):
         (["export", "--publish", "."], 2, "--publish .: expected a name"),
         (["play", "--video", "nowhere/v.mp4"], 2, "there is no folder nowhere"),
         (["play", "--commands", "taken"], 2, "taken"),
+        (["play", "--seconds", "nan"], 2, "--seconds: got 'nan'"),
+        (["play", "--seconds", "0"], 2, "expected a time above zero"),
     ],
 )
 def test_a_wrong_option_is_named(refused, checkpoint, words, code, message):
