@@ -65,7 +65,7 @@ def main(argv: Sequence[str]) -> int:
     substeps = round(policy.contract.step_dt / args.physics_dt) if args.physics_dt > 0 else 0
     if not 1 <= substeps <= MAX_SUBSTEPS or abs(substeps * args.physics_dt - policy.contract.step_dt) > 1e-9:
         step = policy.contract.step_dt
-        raise ConfigError(f"--physics-dt: got {args.physics_dt:g}, expected {step:g} s over 1 to {MAX_SUBSTEPS}.")
+        raise ConfigError(f"--physics-dt: got {args.physics_dt:g}, expected a whole fraction of {step:g} s.")
     outcome = simulate(policy, spec, script, substeps)
     fate = f"fell after {outcome.survived_s:.1f} s" if outcome.fell else f"stood for all of {outcome.survived_s:.1f} s"
     print(f"{spec.name}: {fate}, physics step {args.physics_dt:g} s")

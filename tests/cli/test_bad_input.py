@@ -147,6 +147,7 @@ def test_where_no_checkpoint_is_it_is_said_so(refused, verb):
         (["export", "--out", "."], 2, "expected the name of a file that ends in .onnx"),
         (["export", "--publish", "."], 2, "--publish .: expected a name"),
         (["play", "--video", "nowhere/v.mp4"], 2, "there is no folder nowhere"),
+        (["play", "--video", "folder.mp4"], 2, "folder.mp4: is a folder"),
         (["play", "--commands", "taken"], 2, "taken"),
         (["play", "--seconds", "nan"], 2, "--seconds: got 'nan'"),
         (["play", "--seconds", "0"], 2, "expected a time above zero"),
@@ -154,6 +155,7 @@ def test_where_no_checkpoint_is_it_is_said_so(refused, verb):
 )
 def test_a_wrong_option_is_named(refused, checkpoint, words, code, message):
     Path("taken").write_text("a file")
+    Path("folder.mp4").mkdir()
     refused([words[0], *words[1:-2], str(checkpoint), *words[-2:]], code, message)
 
 
