@@ -129,7 +129,7 @@ class HumanoidEnv(VecEnv):
         self._all = torch.arange(num_envs, device=self.device)
         self._allocate(dtype)
         self._apply_aids()
-        self._reset(self._all)
+        self.reset()
         self._no_observations = self.get_observations()[:0].clone()
 
     def _allocate(self, dtype: torch.dtype) -> None:
@@ -185,13 +185,13 @@ class HumanoidEnv(VecEnv):
         extras["log"] = self._account(terms, reasons, causes, dones, time_outs)
         reset_ids = dones.nonzero().squeeze(1)
         if len(reset_ids):
-            self._reset(reset_ids)
+            self._reset(reset_ids, fallen[reset_ids])
         self._resample()
         return self.get_observations(), rewards.float(), dones, extras
 
     def reset(self) -> None:
         """Start new episodes everywhere; random streams go on."""
-        self._reset(self._all)
+        self._reset(self._all, torch.zeros_like(self._all, dtype=torch.bool))
 
     def get_observations(self) -> TensorDict:
         """Observation groups at the present state, fresh tensors."""
@@ -307,8 +307,8 @@ class HumanoidEnv(VecEnv):
         self._last_frame = frame
         self.history.push(sensed)
 
-    def _reset(self, ids: Tensor) -> None:
-        """Start new episodes; other environments are untouched, bit for bit."""
+    def _reset(self, ids: Tensor, fallen: Tensor) -> None:
+        """Start new episodes, some of them, bool (n,), after a fall; other environments are untouched, bit for bit."""
         count = self.episode_count[ids]
         self.ground.advance(ids, count, self.state, self.episode_length_buf)
         self.randomizer.reset(ids, count, self.step_dt)
@@ -317,7 +317,7 @@ class HumanoidEnv(VecEnv):
         self.episode_count[ids] += 1
         self.episode_length_buf = self.episode_length_buf.index_fill(0, ids, 0)
         self.phase = self.phase.index_fill(0, ids, 0.0)
-        self.commands.draw(ids)
+        self.commands.renew(ids, fallen)
         for name in ("_actions", "_last_actions", "_last_last_actions", "_last_contact"):
             setattr(self, name, getattr(self, name).index_fill(0, ids, 0))
         self._last_joint_vel = self._last_joint_vel.index_copy(0, ids, staged[:, self.pool.columns["joint_vel"]])
@@ -328,7 +328,7 @@ class HumanoidEnv(VecEnv):
 
     def _resample(self) -> None:
         """Draw new commands where their time is up."""
-        ids = self.commands.due(self.episode_length_buf)
+        ids = self.commands.due()
         if len(ids):
             self.commands.draw(ids)
             self.commands.show(self.state, self.phase, self.task.gait)

@@ -105,6 +105,9 @@ class CommandsCfg:
     body_pitch: CommandRangeCfg = CommandRangeCfg(initial=(-0.3, 0.5), finishing=(-0.3, 0.5))
     resampling_time_s: float = 10.0
     """Time between draws [s]; commands are also drawn at reset (HugWBC 2)."""
+    redraw_after_fall: bool = True
+    """Whether a fall ends a command's time (HugWBC 2). Off, the robot gets up under the same command: what it fails at
+    then takes as much time as what it can do (ours: else a robot that falls in 3 s stands in 3 % of its time)."""
     standing_probability: float = 0.1
     """Share of draws with zero velocity [-] (HugWBC 2)."""
     lin_vel_dead_zone: float = 0.15
