@@ -82,8 +82,11 @@ class EaglePPO(PPO):
         self._skipped_in_a_row = 0
         self._withheld_steps = 0
         self.symmetry = AuxiliaryLosses([])
-        parameters = [*actor.parameters(), *critic.parameters()]
-        self.optimizer = torch.optim.Adam(parameters, lr=cfg.learning_rate, fused=True)
+        groups = [
+            {"params": list(actor.parameters()), "lr": cfg.learning_rate},
+            {"params": list(critic.parameters()), "lr": cfg.critic_learning_rate},
+        ]
+        self.optimizer = torch.optim.Adam(groups, fused=True)
         self.optimizer.register_step_post_hook(lambda *_: self._raw_actor.distribution.project_std())
 
     @staticmethod
@@ -150,7 +153,8 @@ class EaglePPO(PPO):
             self.optimizer.zero_grad(set_to_none=True)
             self._withheld_steps += 1
             return
-        grads = [p.grad for p in self.optimizer.param_groups[0]["params"] if p.grad is not None]
+        parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
+        grads = [p.grad for p in parameters if p.grad is not None]
         if torch.isfinite(torch.nn.utils.get_total_norm(grads)):
             self._skipped_in_a_row = 0
             return
@@ -176,6 +180,7 @@ class EaglePPO(PPO):
             self.learning_rate = loaded_dict["learning_rate"]
             self.num_updates = loaded_dict["counters"]["num_updates"]
             self.skipped_steps = loaded_dict["counters"]["skipped_steps"]
+        self.optimizer.param_groups[1]["lr"] = self.cfg.critic_learning_rate
         return iteration
 
     def _too_far(self) -> bool:
@@ -185,14 +190,13 @@ class EaglePPO(PPO):
         return self._mean_over_processes(self.symmetry.last_kl.clone()) > MAX_KL_RATIO * self.cfg.desired_kl
 
     def _adapt_learning_rate(self, kl: float) -> None:
-        """Lower the learning rate where the policy moved too far in the last epoch, raise it where too little."""
+        """Lower the actor's learning rate where the policy moved too far in the last epoch, raise it where too little."""
         low, high = self.cfg.learning_rate_range
         if kl > 2 * self.cfg.desired_kl:
             self.learning_rate = max(low, self.learning_rate / LEARNING_RATE_FACTOR)
         elif 0 < kl < self.cfg.desired_kl / 2:
             self.learning_rate = min(high, self.learning_rate * LEARNING_RATE_FACTOR)
-        for group in self.optimizer.param_groups:
-            group["lr"] = self.learning_rate
+        self.optimizer.param_groups[0]["lr"] = self.learning_rate
 
     def _normalize_over_processes(self) -> None:
         """Give the advantages of all processes together zero mean and unit variance, as one process would."""

@@ -163,6 +163,14 @@ def test_the_learning_rate_follows_the_kl_of_the_last_epoch():
     assert runner.alg.update()["Loss/kl"] > 0.0, "the KL of the first epoch, before any step, is zero"
 
 
+def test_the_critic_s_learning_rate_is_its_own():
+    runner = make_runner(critic_learning_rate=3e-4, desired_kl=1e-6)
+    collect(runner)
+    runner.alg.update()
+    assert runner.alg.learning_rate < runner.alg.cfg.learning_rate, "the actor's follows the KL"
+    assert [group["lr"] for group in runner.alg.optimizer.param_groups] == [runner.alg.learning_rate, 3e-4]
+
+
 @pytest.mark.parametrize(("kl", "factor"), [(0.0, 1), (0.004, 1.5), (0.006, 1), (0.019, 1), (0.021, 1 / 1.5)])
 def test_the_learning_rate_is_kept_while_the_kl_is_within_a_factor_of_two_of_its_target(kl, factor):
     alg = make_runner(desired_kl=0.01).alg
