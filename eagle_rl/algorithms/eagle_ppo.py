@@ -28,6 +28,7 @@ from eagle_rl.algorithms.specialists import SpecialistBank
 from eagle_rl.config.schema import AlgoCfg
 from eagle_rl.errors import HealthError
 from eagle_rl.models import EagleActor
+from eagle_rl.models.precision import keep_outputs_exact, multiplies_in_bfloat16
 
 MAX_SKIPPED_STEPS = 3
 """Non-finite gradients in a row after which learning stops."""
@@ -70,9 +71,12 @@ class EaglePPO(PPO):
             max_grad_norm=cfg.max_grad_norm,
             use_clipped_value_loss=cfg.use_clipped_value_loss,
             schedule="fixed",
+            use_mixed_precision=multiplies_in_bfloat16(cfg.precision, device),
             device=device,
             multi_gpu_cfg=multi_gpu_cfg,
         )
+        for model in (actor, critic):
+            keep_outputs_exact(model)
         self.cfg = cfg
         self.is_multi_gpu = True  # makes update() call reduce_parameters(), where gradients are checked
         self.specialists: SpecialistBank | None = None
@@ -111,6 +115,11 @@ class EaglePPO(PPO):
             self.symmetry.terms.append(
                 Kickstart(lambda: cfg.kickstart_coef * math.exp(-cfg.kickstart_decay * self.num_updates))
             )
+
+    def act(self, obs: TensorDict) -> Tensor:
+        """Sample actions, computed as the update will compute them, so that its importance ratios start at one."""
+        with torch.autocast(torch.device(self.device).type, torch.bfloat16, self.use_mixed_precision):
+            return super().act(obs)
 
     def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: Mapping[str, Any]) -> None:
         """Record one step; a time-out is bootstrapped with the value of its true final observation."""

@@ -397,6 +397,9 @@ class AlgoCfg:
     """alpha of Kickstarting's alpha * exp(-lambda t) * KL(pi_s || pi_g); not given by the paper (ours)."""
     kickstart_decay: float = 0.005
     """lambda per iteration (ours)."""
+    precision: Literal["auto", "float32", "bfloat16"] = "auto"
+    """Of the hidden layers in training; ``auto`` is bfloat16 where the CPU has instructions for it. Parameters,
+    outputs, losses, evaluation and specialists' labels are float32 in any case (docs/performance.md) (ours)."""
     network: NetworkCfg = field(default_factory=NetworkCfg)
 
 

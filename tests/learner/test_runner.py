@@ -58,9 +58,10 @@ def compare(a, b, where: str) -> None:
         assert a == b, where
 
 
-def test_training_raises_the_reward_of_every_robot(tmp_path):
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+def test_training_raises_the_reward_of_every_robot(tmp_path, precision):
     algo = {"gamma": 0.8, "num_steps_per_env": 16, "desired_kl": 0.02, "learning_rate_range": (1e-4, 1e-2)}
-    make_runner(tmp_path, ToyEnv(48), **algo).learn(30)
+    make_runner(tmp_path, ToyEnv(48), precision=precision, **algo).learn(30)
     rows = metrics(tmp_path)
     first, last = rows[4], rows[-1]  # by the fifth iteration the shortened first episodes are few
     for robot, share in {"/one": 0.7, "/two": 0.7, "/three": 0.9, "": 0.7}.items():
@@ -104,13 +105,14 @@ def test_logged_rewards_and_lengths_are_those_of_finished_episodes():
     assert tags["Train/mean_reward/one"] == pytest.approx(sum(rewards) / len(rewards))
 
 
-def test_a_resumed_run_equals_the_uninterrupted_one_bit_for_bit(tmp_path):
-    whole = make_runner(tmp_path / "whole")
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+def test_a_resumed_run_equals_the_uninterrupted_one_bit_for_bit(tmp_path, precision):
+    whole = make_runner(tmp_path / "whole", precision=precision)
     whole.learn(5)
-    cut = make_runner(tmp_path / "cut")
+    cut = make_runner(tmp_path / "cut", precision=precision)
     path = cut.learn(3)  # 24 steps: in the middle of episodes of 16
     torch.manual_seed(12345)
-    resumed = make_runner(tmp_path / "cut")
+    resumed = make_runner(tmp_path / "cut", precision=precision)
     resumed.load(path)
     resumed.learn(2)
     assert_same(whole, resumed)
