@@ -95,7 +95,7 @@ class MeasuringEnv(ScriptedEnv):
 
 
 def test_a_perfect_tracker_answers_with_the_command_until_it_falls():
-    def falls(robots: Sequence[str], num_envs: int, task: TaskCfg, seed: int) -> MeasuringEnv:
+    def falls(robots: Sequence[str], num_envs: int, task: TaskCfg, seed: int, first: int = 0) -> MeasuringEnv:
         return MeasuringEnv(num_envs, task, fall_at=500)
 
     response = command_responses(perfect, falls, ["a"], TaskCfg(), EvaluationCfg())[0]
@@ -109,7 +109,7 @@ def test_a_sweep_changes_one_thing_and_passes_through_the_nominal_world(kind):
     assert len(nominal) == 1, f"{kind} must contain the nominal world once"
     seen = []
 
-    def spy(robots: Sequence[str], num_envs: int, task: TaskCfg, seed: int) -> ScriptedEnv:
+    def spy(robots: Sequence[str], num_envs: int, task: TaskCfg, seed: int, first: int = 0) -> ScriptedEnv:
         seen.append(task.randomization)
         return ScriptedEnv(num_envs, task)
 
