@@ -136,6 +136,11 @@ class AuxiliaryLosses:
         self._means.add(log)
         return total
 
+    @property
+    def last_kl(self) -> Tensor:
+        """Mean KL(old || new) of the last minibatch [nat], scalar."""
+        return self._kls[-1]
+
     def pop_means(self) -> dict[str, float]:
         """Means of the unweighted losses since the last call, by tag."""
         return self._means.pop()

@@ -374,7 +374,9 @@ class AlgoCfg:
     learning_rate: float = 1e-3
     learning_rate_range: Range = (1e-5, 2e-3)
     desired_kl: float = 0.01
-    """KL target of the adaptive learning rate, which moves once an iteration (ours: per minibatch it bounced)."""
+    """KL target of the actor's adaptive learning rate, which moves once an iteration (ours: per minibatch it bounced)."""
+    critic_learning_rate: float = 5e-4
+    """Of the critic, fixed (ours): the KL says nothing about the critic, which starved at the actor's 4e-5."""
     entropy_coef: float = 0.002
     value_loss_coef: float = 1.0
     use_clipped_value_loss: bool = False

@@ -38,6 +38,7 @@ BOUNDS: dict[str, _Bound] = dict.fromkeys(
     task.terminations.episode_length_s task.terminations.max_roll task.terminations.max_pitch
     task.randomization.push_interval_s task.aids.interval_steps
     algo.num_steps_per_env algo.num_learning_epochs algo.num_mini_batches algo.clip_param algo.learning_rate
+    algo.critic_learning_rate
     algo.desired_kl algo.max_grad_norm algo.network.embedding_dim algo.network.init_std
     plan.generalist_env_steps plan.max_rounds
     evaluation.num_envs_per_robot evaluation.num_steps evaluation.physics_dt evaluation.decimation

@@ -242,10 +242,13 @@ class EagleRunner(OnPolicyRunner):
         self.provenance = dataclasses.replace(self.provenance, drifted=drifted)
 
     def load_weights(self, path: Path | str) -> None:
-        """Start from the policy and critic of a checkpoint; optimiser, counters and environment stay fresh."""
+        """Start from the learner of a checkpoint: policy, critic, optimiser and learning rate; the rest stays fresh.
+
+        A fresh optimiser at the first learning rate would undo a trained policy in its first update.
+        """
         checkpoint = ckpt.load_checkpoint(Path(path), self.provenance.slot_table_hash)
         self._require_same_shapes(checkpoint)
-        self.alg.load(checkpoint.state["algorithm"], {"actor": True, "critic": True})
+        self.alg.load(checkpoint.state["algorithm"], {"actor": True, "critic": True, "optimizer": True})
 
     def _state(self) -> dict[str, Any]:
         """Everything a checkpoint holds; the part of each process is gathered in the first."""

@@ -82,7 +82,12 @@ class ActiveCommands:
 
     def state_dict(self) -> dict[str, Tensor]:
         """Commands in force and the curriculum; not what is pinned."""
-        return {"command": self.command.clone(), "count": self.count.clone(), "age": self.age.clone(), **self.sampler.state_dict()}
+        return {
+            "command": self.command.clone(),
+            "count": self.count.clone(),
+            "age": self.age.clone(),
+            **self.sampler.state_dict(),
+        }
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Restore what :meth:`state_dict` returned."""

@@ -183,14 +183,17 @@ def test_a_checkpoint_of_another_number_of_processes_is_refused(tmp_path):
         make_runner().load(path)
 
 
-def test_a_stage_starts_from_the_weights_of_another_with_fresh_counters(tmp_path):
+def test_a_stage_starts_from_the_learner_of_another_with_fresh_counters(tmp_path):
     root = make_runner(tmp_path)
     path = root.learn(2)
     stage = make_runner(env=ToyEnv(8, ("two",)), seed=9)
     stage.load_weights(path)
     compare(parameters(root), parameters(stage), "weights")
     assert stage.current_learning_iteration == stage.env_steps == stage.alg.num_updates == 0
-    assert not stage.alg.optimizer.state
+    assert stage.alg.learning_rate == root.alg.learning_rate != root.alg.cfg.learning_rate
+    moments = [[s["exp_avg"] for s in runner.alg.optimizer.state_dict()["state"].values()] for runner in (root, stage)]
+    assert moments[0], "the optimiser has no state to take over"
+    assert all(torch.equal(*pair) for pair in zip(*moments, strict=True))
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
