@@ -11,6 +11,7 @@ from matplotlib.figure import Figure as Figure  # re-exported, so that only this
 from numpy.typing import NDArray
 
 from eagle_rl.evaluation.curves import Curve, RoundScores
+from eagle_rl.evaluation.estimator import EstimatorReport
 from eagle_rl.evaluation.latents import Embeddings
 from eagle_rl.evaluation.metrics import RobotMetrics
 from eagle_rl.evaluation.reference import STAND_STILL
@@ -156,3 +157,48 @@ def _relative(metrics: RobotMetrics) -> float:
     """Mean charged error of one robot as a share of standing still."""
     charged = metrics.subsets["all"].charged
     return float(np.mean([e / floor for e, floor in zip(charged, STAND_STILL, strict=True) if e is not None]))
+
+
+def estimator_bars(report: EstimatorReport) -> Figure:
+    """Explained variance of each channel: bars over the fleet and within robots, a marker for each robot.
+
+    What is far below zero, an estimate that errs more than the target varies, is drawn at the lower edge.
+    """
+    figure, axes = _panels(1, 1, width=10.0, height=4.2)
+    ax = axes[0, 0]
+    place, floor = np.arange(len(report.channels)), -0.5
+    for shift, label, scores, colour in (
+        (-0.2, "fleet", report.fleet, "0.75"),
+        (0.2, "within robots", report.within, "0.45"),
+    ):
+        shares = [floor if s.explained is None else max(floor, s.explained) for s in scores]
+        ax.bar(place + shift, np.array(shares), 0.4, color=colour, label=label)
+    colours = _palette(report.robots)
+    for i, (robot, scores) in enumerate(report.robots.items()):
+        shares = [np.nan if s.explained is None else max(floor, s.explained) for s in scores]
+        style = {"color": colours[robot], "marker": MARKERS[i % 7], "markersize": 4, "linestyle": "none"}
+        ax.plot(place + 0.2 + 0.07 * (i - 0.5 * (len(colours) - 1)), shares, label=robot, **style)
+    ax.set_xticks(place, [channel.name for channel in report.channels], rotation=60, ha="right", fontsize=8)
+    ax.set_xlim(-0.6, len(place) - 0.4)
+    ax.set_ylim(floor, 1.02)
+    ax.axhline(0.0, color="black", linewidth=0.8)
+    ax.set_ylabel("explained variance [-]", fontsize=9)
+    ax.grid(axis="x", visible=False)
+    _legend(figure, ax, len(colours) + 2)
+    return figure
+
+
+def film_strips(strips: Mapping[str, Sequence[tuple[NDArray[np.uint8], str]]]) -> Figure:
+    """Pictures over time, one row per robot, each with a line of text above it."""
+    columns = max(len(strip) for strip in strips.values())
+    height, width, _ = next(iter(strips.values()))[0][0].shape
+    figure, axes = _panels(len(strips), columns, width=1.7, height=1.7 * height / width + 0.35)
+    for row, (robot, strip) in zip(axes, strips.items(), strict=True):
+        for ax, (picture, text) in zip(row, strip, strict=True):
+            ax.imshow(picture)
+            ax.set_title(text, fontsize=7.5)
+            ax.set(xticks=[], yticks=[])
+            ax.grid(visible=False)
+            ax.spines[:].set_visible(False)
+        row[0].set_ylabel(robot, fontsize=10)
+    return figure
