@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Figure  # re-exported, so that only this module names matplotlib
 from numpy.typing import NDArray
+from PIL import Image
 
 from eagle_rl.evaluation.curves import Curve, RoundScores
 from eagle_rl.evaluation.estimator import EstimatorReport
@@ -43,12 +44,14 @@ def _legend(figure: Figure, ax: Axes, columns: int) -> None:
 
 
 def save(figure: Figure, folder: Path, name: str) -> list[Path]:
-    """Write a figure as PNG and PDF; the paths."""
+    """Write a figure as PNG, of 256 colours to keep it small, and PDF; the paths."""
     folder.mkdir(parents=True, exist_ok=True)
-    paths = [folder / f"{name}.{suffix}" for suffix in ("png", "pdf")]
-    for path in paths:
-        figure.savefig(path, dpi=200)
-    return paths
+    png, pdf = (folder / f"{name}.{suffix}" for suffix in ("png", "pdf"))
+    figure.savefig(pdf, dpi=150)  # of pictures in it; lines have none
+    figure.savefig(png, dpi=200)
+    with Image.open(png) as picture:
+        picture.convert("RGB").quantize(256, dither=Image.Dither.NONE).save(png, optimize=True)
+    return [png, pdf]
 
 
 def learning_curves(panels: Mapping[str, Sequence[Curve]]) -> Figure:
