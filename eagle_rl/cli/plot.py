@@ -87,15 +87,21 @@ def _curves(args: argparse.Namespace) -> dict[str, Figure]:
 
 
 def _rounds(args: argparse.Namespace) -> dict[str, Figure]:
+    """One figure per run, or file of its scores; the scores as csv."""
     from eagle_rl.evaluation import plots
-    from eagle_rl.evaluation.curves import read_rounds
+    from eagle_rl.evaluation.curves import read_rounds, rounds_from_csv, rounds_to_csv
     from eagle_rl.runners.judged import judged_stages
     from eagle_rl.runners.records import read_plan
 
     figures = {}
-    for name, run in map(_named, args.paths):
-        judged = [(stage.round, stage.specialised, file) for stage, file in judged_stages(run, read_plan(run))]
-        figures[name] = plots.error_rounds(read_rounds(judged))
+    for name, path in map(_named, args.paths):
+        if path.suffix == ".csv":
+            scores = rounds_from_csv(path)
+        else:
+            judged = judged_stages(path, read_plan(path))
+            scores = read_rounds([(stage.round, stage.specialised, file) for stage, file in judged])
+        figures[name] = plots.error_rounds(scores)
+        _write(args.out / f"rounds_{name}.csv", rounds_to_csv(scores))
     return figures
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from eagle_rl.evaluation.curves import Curve, RoundScores
-from eagle_rl.evaluation.estimator import EstimatorReport
+from eagle_rl.evaluation.estimator import ChannelScore, EstimatorReport
 from eagle_rl.evaluation.latents import Embeddings
 from eagle_rl.evaluation.metrics import RobotMetrics
 from eagle_rl.evaluation.reference import STAND_STILL
@@ -162,25 +162,23 @@ def _relative(metrics: RobotMetrics) -> float:
     return float(np.mean([e / floor for e, floor in zip(charged, STAND_STILL, strict=True) if e is not None]))
 
 
-def estimator_bars(report: EstimatorReport) -> Figure:
+def estimator_bars(report: EstimatorReport, floor: float = -0.5) -> Figure:
     """Explained variance of each channel: bars over the fleet and within robots, a marker for each robot.
 
-    What is far below zero, an estimate that errs more than the target varies, is drawn at the lower edge.
+    What is below ``floor``, an estimate that errs more than the target varies, is drawn there.
     """
     figure, axes = _panels(1, 1, width=10.0, height=4.2)
-    ax = axes[0, 0]
-    place, floor = np.arange(len(report.channels)), -0.5
+    ax, place = axes[0, 0], np.arange(len(report.channels))
     for shift, label, scores, colour in (
-        (-0.2, "fleet", report.fleet, "0.75"),
-        (0.2, "within robots", report.within, "0.45"),
+        (-0.2, "fleet", report.fleet, "0.78"),
+        (0.2, "within robots", report.within, "0.5"),
     ):
-        shares = [floor if s.explained is None else max(floor, s.explained) for s in scores]
-        ax.bar(place + shift, np.array(shares), 0.4, color=colour, label=label)
+        ax.bar(place + shift, _explained(scores, floor), 0.4, color=colour, label=label)
     colours = _palette(report.robots)
     for i, (robot, scores) in enumerate(report.robots.items()):
-        shares = [np.nan if s.explained is None else max(floor, s.explained) for s in scores]
         style = {"color": colours[robot], "marker": MARKERS[i % 7], "markersize": 4, "linestyle": "none"}
-        ax.plot(place + 0.2 + 0.07 * (i - 0.5 * (len(colours) - 1)), shares, label=robot, **style)
+        shift = 0.2 + 0.07 * (i - 0.5 * (len(colours) - 1))
+        ax.plot(place + shift, _explained(scores, floor), label=robot, clip_on=False, **style)
     ax.set_xticks(place, [channel.name for channel in report.channels], rotation=60, ha="right", fontsize=8)
     ax.set_xlim(-0.6, len(place) - 0.4)
     ax.set_ylim(floor, 1.02)
@@ -189,6 +187,11 @@ def estimator_bars(report: EstimatorReport) -> Figure:
     ax.grid(axis="x", visible=False)
     _legend(figure, ax, len(colours) + 2)
     return figure
+
+
+def _explained(scores: Sequence[ChannelScore], floor: float) -> NDArray[np.float64]:
+    """Explained variances, not below ``floor``; NaN where there is none."""
+    return np.array([np.nan if score.explained is None else max(floor, score.explained) for score in scores])
 
 
 def film_strips(strips: Mapping[str, Sequence[tuple[NDArray[np.uint8], str]]]) -> Figure:

@@ -46,7 +46,10 @@ def test_curves_are_drawn_for_every_stage(run, tmp_path, capsys):
 
 def test_rounds_are_drawn_in_one_figure(run, tmp_path):
     assert main(["rounds", f"toy={run.run_dir}", "--out", str(tmp_path)]) == 0
-    assert {path.name for path in tmp_path.iterdir()} == {"rounds_toy.png", "rounds_toy.pdf"}
+    assert {path.name for path in tmp_path.iterdir()} == {f"rounds_toy.{suffix}" for suffix in ("png", "pdf", "csv")}
+    stored, again = tmp_path / "rounds_toy.csv", tmp_path / "again"
+    assert main(["rounds", f"toy={stored}", "--out", str(again)]) == 0
+    assert (again / stored.name).read_text() == stored.read_text()
 
 
 def test_a_folder_that_is_no_run_is_refused(tmp_path):
