@@ -20,7 +20,7 @@ POSTURES = {"squat": (3, "m"), "lean": (4, "rad")}
 """Command script of each posture, the column of the command it asks for, and that one's unit."""
 PICTURES = 6
 SIZE = (300, 360)
-FROM_THE_SIDE = CameraCfg(azimuth_deg=105.0, elevation_deg=-6.0, height=0.85)
+FROM_THE_SIDE = CameraCfg(azimuth_deg=105.0, elevation_deg=-6.0, height=0.95)
 
 Strip = list[tuple[Frame, str]]
 """Pictures over time with what is commanded and measured in each."""

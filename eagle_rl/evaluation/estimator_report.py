@@ -14,13 +14,13 @@ def _share(value: float | None) -> str:
 
 def to_markdown(report: EstimatorReport, caption: str) -> str:
     """One line per channel: explained variance of the fleet, within robots and of each robot, then the errors."""
-    head = ["channel", "fleet", "within", *report.robots, "RMSE", "prior", "unit"]
+    head = ["channel", "fleet", "within", *report.robots, "RMSE", "fleet's prior", "robot's prior", "unit"]
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     for i, channel in enumerate(report.channels):
-        within = report.within[i]
-        scores = [report.fleet[i], within, *(robot[i] for robot in report.robots.values())]
-        cells = [channel.name, *(_share(score.explained) for score in scores)]
-        lines.append("| " + " | ".join([*cells, f"{within.rmse:.3g}", f"{within.prior:.3g}", channel.unit]) + " |")
+        fleet, within = report.fleet[i], report.within[i]
+        shares = [_share(score.explained) for score in (fleet, within, *(robot[i] for robot in report.robots.values()))]
+        errors = [f"{error:.3g}" for error in (fleet.rmse, fleet.prior, within.prior)]
+        lines.append("| " + " | ".join([channel.name, *shares, *errors, channel.unit]) + " |")
     return "\n".join([*lines, "", caption, ""])
 
 
@@ -29,10 +29,11 @@ def describe(envs: int, steps: int, seed: int, checkpoint: str) -> str:
     return (
         "Explained variance, 1 - Var(error) / Var(target): over the whole fleet, where telling the robots apart "
         "explains most; within robots, variances about each robot's own mean; and of each robot. RMSE is over the "
-        "fleet, bias included; prior is the standard deviation within a robot, the error of somebody who knows which "
-        f"robot it is and nothing more. {envs} environments a robot, {steps} steps, five samples a second from 1 s on "
-        "until the first fall; full randomization, pushes and sensor noise, all commands drawn every 4 s; "
-        f"seed {seed}. Checkpoint (sha256): {checkpoint[:12]}."
+        "fleet, bias included. Priors are standard deviations: the fleet's is the error of somebody who knows nothing, "
+        "a robot's that of somebody who knows which robot it is and nothing more. "
+        f"{envs} environments a robot, {steps} steps, five samples a second from 1 s on until the first fall; full "
+        f"randomization, pushes and sensor noise, all commands drawn every 4 s; seed {seed}. "
+        f"Checkpoint (sha256): {checkpoint[:12]}."
     )
 
 
