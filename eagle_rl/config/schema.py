@@ -436,8 +436,9 @@ class EvaluationCfg:
 
     num_envs_per_robot: int = 2048
     num_steps: int = 1000
-    protocol: Literal["single", "joint"] = "joint"
-    """``single`` varies one command and keeps the others at zero; ``joint`` samples all five."""
+    protocol: Literal["single", "joint", "standing"] = "joint"
+    """``single`` varies one command and keeps the others at zero; ``joint`` samples all five; ``standing`` samples
+    posture with all velocities exactly zero, in every second draw where commands are redrawn."""
     resampling_time_s: float = 0.0
     """0 keeps commands for the episode; otherwise redraw every so many seconds."""
     randomization: bool = False

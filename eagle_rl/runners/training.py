@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,9 +14,9 @@ from rsl_rl.env import VecEnv
 
 from eagle_rl.algorithms.specialists import SpecialistBank
 from eagle_rl.config.load import experiment_from_plain
-from eagle_rl.config.schema import ExperimentCfg, TaskCfg
+from eagle_rl.config.schema import ExperimentCfg
 from eagle_rl.errors import CheckpointError
-from eagle_rl.evaluation.evaluate import Policy
+from eagle_rl.evaluation.evaluate import MakeEnv, Policy
 from eagle_rl.models import EagleActor
 from eagle_rl.runners.checkpoint import latest_checkpoint, load_actor, read_manifest, verify_checkpoint
 from eagle_rl.runners.compass import DemonstrationEnv, ResidualBank, ResidualEnv, ResidualPolicy, begin_residual
@@ -25,9 +25,6 @@ from eagle_rl.runners.on_policy import EagleRunner, make_train_cfg
 from eagle_rl.runners.plan import Stage, warm_task
 from eagle_rl.runners.provenance import Provenance, changes
 from eagle_rl.runners.published import SUFFIX
-
-MakeEnv = Callable[[Sequence[str], int, TaskCfg, int], Any]
-"""Builds an environment from robot names, number of environments, task and seed; picklable for several jobs."""
 
 
 @dataclass(frozen=True, kw_only=True)

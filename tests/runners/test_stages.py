@@ -60,7 +60,7 @@ def test_a_specialist_starts_from_the_generalists_weights(tmp_path):
     cfg = toy_experiment(iterations=1, judge_envs=0)
     seen = {}
 
-    def watch(robots, num_envs, task, seed):
+    def watch(robots, num_envs, task, seed, first=0):
         seen[tuple(robots)] = task
         return make_toy_env(robots, num_envs, task, seed)
 
