@@ -100,7 +100,7 @@ class HumanoidEnv(VecEnv):
             RobotBatch(spec, build_model(spec, task.sim, field), count, task.sim.decimation, num_threads)
             for spec, count in zip(robots, counts, strict=True)
         ]
-        self.pool = PhysicsPool(batches, self.device, dtype)
+        self.pool = PhysicsPool(batches, self.device, dtype, overlap=num_threads != 1)
         nominal = pool_robots(robots, counts, task.control, task.rewards, self.device, dtype)
         self.rng = CounterRng(
             seed,
