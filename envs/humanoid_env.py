@@ -74,6 +74,7 @@ class HumanoidEnv(VecEnv):
         device: str = "cpu",
         num_threads: int = 0,
         dtype: torch.dtype = torch.float32,
+        first_env: int = 0,
     ) -> None:
         """Build the pool and reset every environment.
 
@@ -85,6 +86,8 @@ class HumanoidEnv(VecEnv):
             device: where everything but the physics lives.
             num_threads: physics threads, 0 for one per core.
             dtype: precision of the pooled state; observations are always float32.
+            first_env: number each robot's first environment goes by in the random streams, so that a large pool can be
+                simulated in parts that draw what the whole would.
         """
         self.task = task
         self.num_envs = num_envs
@@ -105,7 +108,7 @@ class HumanoidEnv(VecEnv):
         self.rng = CounterRng(
             seed,
             [name for name, count in zip(self.robot_names, counts, strict=True) for _ in range(count)],
-            torch.cat([torch.arange(count) for count in counts]).to(self.device),
+            torch.cat([first_env + torch.arange(count) for count in counts]).to(self.device),
         )
         self.randomizer = Randomizer(task.randomization, self.pool, nominal, self.rng)
         self.robots = self.randomizer.robots

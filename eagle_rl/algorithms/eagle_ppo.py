@@ -199,7 +199,7 @@ class EaglePPO(PPO):
         return self._mean_over_processes(self.symmetry.last_kl.clone()) > MAX_KL_RATIO * self.cfg.desired_kl
 
     def _adapt_learning_rate(self, kl: float) -> None:
-        """Lower the actor's learning rate where the policy moved too far in the last epoch, raise it where too little."""
+        """Lower the actor's learning rate where the last epoch moved the policy too far, raise it where too little."""
         low, high = self.cfg.learning_rate_range
         if kl > 2 * self.cfg.desired_kl:
             self.learning_rate = max(low, self.learning_rate / LEARNING_RATE_FACTOR)

@@ -66,8 +66,8 @@ class ControlCfg:
     upper_ratio: float = 0.5
     """Extra factor at head and arms [-] (ours)."""
     waist_ratio: float = 0.5
-    """Extra factor at the waist [-] (ours: the noise of a stiff waist shakes a light pelvis; at 0.5 it accounts for half
-    of the yaw-rate error H1 has in training)."""
+    """Extra factor at the waist [-] (ours: the noise of a stiff waist shakes a light pelvis; at 0.5 it makes up half of
+    the yaw-rate error H1 has in training)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -377,7 +377,7 @@ class AlgoCfg:
     learning_rate: float = 1e-3
     learning_rate_range: Range = (1e-5, 2e-3)
     desired_kl: float = 0.01
-    """KL target of the actor's adaptive learning rate, which moves once an iteration (ours: per minibatch it bounced)."""
+    """KL target of the actor's learning rate, which moves once an iteration (ours: per minibatch it bounced)."""
     critic_learning_rate: float = 5e-4
     """Of the critic, fixed (ours): the KL says nothing about the critic, which starved at the actor's 4e-5."""
     entropy_coef: float = 0.002
@@ -436,8 +436,9 @@ class EvaluationCfg:
 
     num_envs_per_robot: int = 2048
     num_steps: int = 1000
-    protocol: Literal["single", "joint"] = "joint"
-    """``single`` varies one command and keeps the others at zero; ``joint`` samples all five."""
+    protocol: Literal["single", "joint", "standing"] = "joint"
+    """``single`` varies one command and keeps the others at zero; ``joint`` samples all five; ``standing`` samples
+    posture with all velocities exactly zero, in every second draw where commands are redrawn."""
     resampling_time_s: float = 0.0
     """0 keeps commands for the episode; otherwise redraw every so many seconds."""
     randomization: bool = False

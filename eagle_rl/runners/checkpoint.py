@@ -21,7 +21,7 @@ from typing import Any
 
 import torch
 
-from eagle_rl.errors import CheckpointError
+from eagle_rl.errors import CheckpointError, EagleWarning
 from eagle_rl.models import EagleActor
 from eagle_rl.runners import published
 from eagle_rl.runners.files import write_atomically
@@ -199,14 +199,15 @@ def best_checkpoint(folder: Path) -> Path | None:
 
 
 def prune_checkpoints(folder: Path, keep: int) -> None:
-    """Delete all but the last ``keep``, the best, and the ends of stages; and what an interrupted save left behind."""
+    """Delete all but the last ``keep``, the best, and the ends of stages; and what interrupted saves left behind."""
     manifests = _manifests(folder)
     last = sorted(manifests, key=iteration_of)[-keep:]
     for path in set(manifests) - {*last, best_checkpoint(folder)}:
         if not manifests[path]["stage_end"]:
             path.with_suffix(".json").unlink(missing_ok=True)
             path.unlink(missing_ok=True)
-    for leftover in folder.glob(".model_*.tmp"):
+    never_completed = [path for path in _data_files(folder) if not path.with_suffix(".json").exists()]
+    for leftover in [*never_completed, *folder.glob(".model_*.tmp")]:
         leftover.unlink(missing_ok=True)
 
 
@@ -243,7 +244,7 @@ def _is_sound(path: Path) -> bool:
     try:
         verify_checkpoint(path)
     except CheckpointError as error:
-        warnings.warn(f"Passing over a checkpoint. {error}", stacklevel=3)
+        warnings.warn(f"Passing over a checkpoint. {error}", EagleWarning, stacklevel=3)
         return False
     return True
 

@@ -7,6 +7,7 @@ import dataclasses
 import io
 import os
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -18,10 +19,11 @@ from rsl_rl.runners import OnPolicyRunner
 from eagle_rl.algorithms.eagle_ppo import EaglePPO
 from eagle_rl.algorithms.specialists import SpecialistBank
 from eagle_rl.config.schema import AlgoCfg, RunCfg
-from eagle_rl.errors import CheckpointError, HealthError, Interrupted
+from eagle_rl.errors import CheckpointError, EagleWarning, HealthError, Interrupted
 from eagle_rl.models import EagleActor
 from eagle_rl.models.actor import ACTOR_INPUTS
 from eagle_rl.runners import checkpoint as ckpt
+from eagle_rl.runners.files import patiently
 from eagle_rl.runners.health import SickRule, require_sound
 from eagle_rl.runners.interrupt import InterruptGuard
 from eagle_rl.runners.progress import ProgressReport
@@ -138,9 +140,9 @@ class EagleRunner(OnPolicyRunner):
                     if self._any_process(interrupt.requested):
                         done = self.current_learning_iteration
                         raise Interrupted(f"Interrupted after iteration {done}, saved as {self.save()}.")
-        except HealthError:
+        except HealthError as error:
             if not self.is_distributed:  # the other processes cannot be asked for their part of the state
-                self.save()
+                self._save_before_stopping(error)
             raise
         return self.save(stage_end=True)
 
@@ -197,7 +199,7 @@ class EagleRunner(OnPolicyRunner):
         """Write a checkpoint, unless one holds this state already, and return its path.
 
         Args:
-            stage_end: mark it as the end of its stage, which is never pruned.
+            stage_end: mark it as the end of its stage, which is never pruned; it is waited for while the disk is full.
 
         Returns:
             None in processes that do not write.
@@ -208,21 +210,34 @@ class EagleRunner(OnPolicyRunner):
         self._require_finite_parameters()
         folder = self.folder / "checkpoints"
         try:
-            if self._saved is not None:
-                return ckpt.mark_stage_end(self._saved) if stage_end else self._saved
-            self._saved = ckpt.save_checkpoint(
-                folder,
-                state,
-                self.provenance,
-                iteration=self.current_learning_iteration,
-                env_steps=self.env_steps,
-                score=self._score,
-                stage_end=stage_end,
-            )
-            ckpt.prune_checkpoints(folder, self.cfg["keep_checkpoints"])
+            return patiently(lambda: self._write(folder, state, True)) if stage_end else self._write(folder, state)
         except OSError as error:
-            raise CheckpointError(f"{folder}: the checkpoint could not be written: {error}.") from error
+            raise CheckpointError(
+                f"{folder}: the checkpoint of iteration {self.current_learning_iteration} could not be written: "
+                f"{error.strerror}. The last good checkpoint stays and can be resumed."
+            ) from error
+
+    def _write(self, folder: Path, state: dict[str, Any], stage_end: bool = False) -> Path:
+        if self._saved is not None and self._saved.exists():
+            return ckpt.mark_stage_end(self._saved) if stage_end else self._saved
+        self._saved = ckpt.save_checkpoint(
+            folder,
+            state,
+            self.provenance,
+            iteration=self.current_learning_iteration,
+            env_steps=self.env_steps,
+            score=self._score,
+            stage_end=stage_end,
+        )
+        ckpt.prune_checkpoints(folder, self.cfg["keep_checkpoints"])
         return self._saved
+
+    def _save_before_stopping(self, reason: HealthError) -> None:
+        """Save what there is; where that fails say so, and leave the reason to be told."""
+        try:
+            self.save()
+        except (CheckpointError, HealthError) as error:
+            warnings.warn(f"{error} The run stops because of another fault: {reason}", EagleWarning, stacklevel=2)
 
     def load(self, path: Path | str, *, allow_drift: bool = False) -> None:
         """Go on exactly where a checkpoint was written; nothing changes unless all of it fits.
@@ -300,7 +315,7 @@ class EagleRunner(OnPolicyRunner):
             try:
                 self.save()
             except CheckpointError as error:
-                self.logger.warn(f"{error} Training goes on; the last good checkpoint stays.")
+                self.logger.warn(f"{error} Training goes on.")
 
     def _require_same_shapes(self, checkpoint: ckpt.Checkpoint) -> None:
         """Refuse weights that do not fit, before any is changed."""

@@ -15,13 +15,14 @@ import torch
 from rich.console import Console
 
 from eagle_rl.config.schema import RunCfg
-from eagle_rl.errors import CheckpointError, HealthError, Interrupted
+from eagle_rl.errors import CheckpointError, EagleWarning, HealthError, Interrupted
 from eagle_rl.runners import checkpoint as ckpt
+from eagle_rl.runners import files
 from eagle_rl.runners.health import require_sound
 from eagle_rl.runners.on_policy import EagleRunner
 from eagle_rl.runners.progress import ProgressReport
 from eagle_rl.runners.provenance import Provenance
-from eagle_rl.runners.training_log import ThrottledWarning
+from eagle_rl.runners.throttle import ThrottledWarning
 from tests.learner.helpers import make_runner, parameters
 from tests.learner.test_eagle_ppo import shaken
 from tests.toy import ToyEnv
@@ -230,7 +231,7 @@ def test_a_second_signal_leaves_at_once_with_the_last_checkpoint_intact(tmp_path
 def test_a_vanished_log_folder_is_reported_once_and_training_goes_on(tmp_path):
     folder = tmp_path / "run"
     runner = make_runner(folder)
-    with pytest.warns(RuntimeWarning, match="training goes on") as caught:
+    with pytest.warns(EagleWarning, match="training goes on") as caught:
         path = runner.learn(4, on_iteration=lambda i: shutil.rmtree(folder) if i == 1 else None)
     assert len(caught) == 1
     assert runner.current_learning_iteration == 4
@@ -238,6 +239,8 @@ def test_a_vanished_log_folder_is_reported_once_and_training_goes_on(tmp_path):
 
 
 def test_a_full_disk_keeps_the_last_good_checkpoint_and_training_goes_on(tmp_path, monkeypatch):
+    monkeypatch.setattr(files, "PATIENCE_S", 0.0)
+
     def fill_disk(iteration: int) -> None:
         if iteration == 2:
             monkeypatch.setattr(ckpt, "write_atomically", full)
@@ -247,7 +250,7 @@ def test_a_full_disk_keeps_the_last_good_checkpoint_and_training_goes_on(tmp_pat
 
     runner = make_runner(tmp_path, run=RunCfg(save_interval=1))
     with (
-        pytest.warns(RuntimeWarning, match=r"No space left.*Training goes on"),
+        pytest.warns(EagleWarning, match=r"No space left.*Training goes on"),
         pytest.raises(CheckpointError, match="could not be written"),
     ):
         runner.learn(4, on_iteration=fill_disk)
@@ -255,10 +258,41 @@ def test_a_full_disk_keeps_the_last_good_checkpoint_and_training_goes_on(tmp_pat
     assert ckpt.latest_checkpoint(tmp_path / "checkpoints").name == "model_2.pt"
 
 
+def test_the_end_of_a_stage_waits_for_a_disk_to_become_free(tmp_path, monkeypatch):
+    save, tries = ckpt.save_checkpoint, []
+
+    def full_twice(*args, **kwargs):
+        tries.append(1)
+        if len(tries) <= 2:
+            raise OSError(28, "No space left on device", "model_1.pt")
+        return save(*args, **kwargs)
+
+    monkeypatch.setattr(ckpt, "save_checkpoint", full_twice)
+    monkeypatch.setattr(files, "RETRY_S", 0.0)
+    with pytest.warns(EagleWarning, match=r"No space left.*waits, for 10 min at most") as caught:
+        path = make_runner(tmp_path).learn(1)
+    assert len(caught) == 1, "once a minute"
+    assert ckpt.verify_checkpoint(path)["stage_end"]
+
+
+def test_a_health_rule_is_named_even_if_the_disk_is_full(tmp_path, monkeypatch):
+    def full(*args, **kwargs):
+        raise OSError(28, "No space left on device", "model_1.pt")
+
+    class Sick(ToyEnv):
+        def step(self, actions):
+            obs, rewards, dones, extras = super().step(actions)
+            return obs, rewards * math.inf, dones, extras
+
+    monkeypatch.setattr(ckpt, "save_checkpoint", full)
+    with pytest.warns(EagleWarning, match="No space left"), pytest.raises(HealthError, match="rewards is not finite"):
+        make_runner(tmp_path, Sick()).learn(1)
+
+
 def test_warnings_are_repeated_once_a_minute_at_most():
     times = iter(range(0, 150, 10))
     warn = ThrottledWarning(lambda: next(times))
-    with pytest.warns(RuntimeWarning, match="full") as caught:
+    with pytest.warns(EagleWarning, match="full") as caught:
         [warn("full") for _ in range(15)]
     assert len(caught) == 3
 
