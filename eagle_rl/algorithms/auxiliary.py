@@ -12,6 +12,7 @@ from torch import Tensor
 
 from eagle_rl.algorithms import losses
 from eagle_rl.algorithms.running_means import RunningMeans
+from eagle_rl.algorithms.stopwatch import Stopwatch
 from eagle_rl.models import EagleActor
 from eagle_rl.models.actor import ACTOR_INPUTS
 
@@ -120,9 +121,10 @@ class AuxiliaryLosses:
     use_mirror_loss = True
     mirror_loss_coeff = 1.0
 
-    def __init__(self, terms: Sequence[AuxiliaryLoss]) -> None:
-        """Add up ``terms``."""
+    def __init__(self, terms: Sequence[AuxiliaryLoss], stopwatch: Stopwatch) -> None:
+        """Add up ``terms``, after which ``stopwatch`` is told that the forward pass is over."""
         self.terms = list(terms)
+        self._stopwatch = stopwatch
         self._means = RunningMeans()
         self._kls: list[Tensor] = []
 
@@ -139,6 +141,7 @@ class AuxiliaryLosses:
             kl = actor.get_kl_divergence(batch.old_distribution_params, actor.output_distribution_params)
             self._kls.append(kl.mean())
         self._means.add(log)
+        self._stopwatch.lap("forward")
         return total
 
     @property

@@ -25,6 +25,7 @@ from torch import Tensor
 from eagle_rl.algorithms.auxiliary import AuxiliaryLosses, Distill, Estimation, Kickstart, Mirror
 from eagle_rl.algorithms.rollout import Rollout
 from eagle_rl.algorithms.specialists import SpecialistBank
+from eagle_rl.algorithms.stopwatch import Stopwatch
 from eagle_rl.config.schema import AlgoCfg
 from eagle_rl.errors import HealthError
 from eagle_rl.models import EagleActor
@@ -85,13 +86,14 @@ class EaglePPO(PPO):
         self.skipped_steps = 0
         self._skipped_in_a_row = 0
         self._withheld_steps = 0
-        self.symmetry = AuxiliaryLosses([])
+        self.stopwatch = Stopwatch()
+        self.symmetry = AuxiliaryLosses([], self.stopwatch)
         groups = [
             {"params": list(actor.parameters()), "lr": cfg.learning_rate},
             {"params": list(critic.parameters()), "lr": cfg.critic_learning_rate},
         ]
         self.optimizer = torch.optim.Adam(groups, fused=True)
-        self.optimizer.register_step_post_hook(lambda *_: self._raw_actor.distribution.project_std())
+        self.optimizer.register_step_post_hook(lambda *_: self._after_step())
 
     @staticmethod
     def construct_algorithm(obs: TensorDict, env: VecEnv, cfg: dict[str, Any], device: str) -> EaglePPO:
@@ -156,6 +158,7 @@ class EaglePPO(PPO):
 
         That is where they are not finite, and where the policy has already left the region PPO's loss is good for.
         """
+        self.stopwatch.lap("backward")
         if self.gpu_world_size > 1:
             super().reduce_parameters()
         if self._too_far():
@@ -197,6 +200,10 @@ class EaglePPO(PPO):
         if not self.cfg.use_ppo_loss:
             return False
         return self._mean_over_processes(self.symmetry.last_kl.clone()) > MAX_KL_RATIO * self.cfg.desired_kl
+
+    def _after_step(self) -> None:
+        self._raw_actor.distribution.project_std()
+        self.stopwatch.lap("optimiser")
 
     def _adapt_learning_rate(self, kl: float) -> None:
         """Lower the actor's learning rate where the last epoch moved the policy too far, raise it where too little."""

@@ -1,5 +1,6 @@
 """Training runs learn, and resume bit for bit."""
 
+import itertools
 import json
 import os
 import socket
@@ -11,10 +12,11 @@ import pytest
 import torch
 from rich.console import Console
 
+from eagle_rl.algorithms.stopwatch import SECTIONS
 from eagle_rl.errors import CheckpointError
 from eagle_rl.runners import checkpoint as ckpt
 from eagle_rl.runners.on_policy import EagleRunner
-from eagle_rl.runners.progress import ProgressReport
+from eagle_rl.runners.progress import BUDGET_INTERVAL, ProgressReport
 from eagle_rl.runners.provenance import Provenance
 from tests.learner.helpers import make_runner, parameters
 from tests.learner.test_eagle_ppo import shaken
@@ -253,6 +255,30 @@ def test_progress_is_one_line_with_the_time_left(capsys):
         progress.update(2, 15360, scalars)
     out = capsys.readouterr().out
     assert out == "round1/distill 2/2 | 0.02M steps | 3000/s | reward 1.50 | length 900 | 0.0 min left\n"
+
+
+def test_a_run_says_now_and_then_where_its_time_goes(capsys):
+    times = {f"Perf/{name}_time": 1.0 for name in SECTIONS} | {"Perf/physics_time": 3.0}
+    with ProgressReport("ppo", 0, 1000, Console(force_terminal=False, width=200)) as progress:
+        for iteration in range(1, 2 * BUDGET_INTERVAL):
+            progress.update(iteration, 1, times | {"Perf/total_fps": 1.0, "Perf/busy_cores": 1.25})
+    (line,) = capsys.readouterr().out.splitlines()
+    assert line.startswith("ppo time: physics 30%, MDP 10%, ")
+    assert line.endswith(" | 1.2 cores busy")
+
+
+def test_the_parts_of_an_iteration_are_logged_and_add_up_to_it(tmp_path, monkeypatch):
+    clock = itertools.count().__next__
+    monkeypatch.setattr("eagle_rl.algorithms.stopwatch.time.perf_counter", lambda: float(clock()))
+    runner = make_runner(tmp_path)
+    runner.learn(1)
+    begin = clock()
+    scalars = runner._iterate()
+    end = clock()
+    seconds = {name: scalars[f"Perf/{name}_time"] for name in SECTIONS}
+    assert seconds.pop("physics") == 0.0, "the toy robots have none"
+    assert all(s > 0 for s in seconds.values()), seconds
+    assert end - begin - sum(seconds.values()) <= 3, "only what is read from the clock before and after"
 
 
 def test_progress_draws_a_bar_on_a_terminal(capsys):
