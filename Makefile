@@ -3,7 +3,7 @@
 #   make train     the quickstart experiment: the whole loop on five robots, a tracking table at the end
 #   make play      the published policy, or CKPT=PATH, on five robots side by side
 #   make test      all tests            make check     format, lint, types
-#   make results   tables and figures of docs/results from the published policy (a quarter of an hour on two cores)
+#   make results   tables and figures of docs/results from the published policy (half an hour on two idle cores)
 #   make bench     throughput           make package   sdist and wheel, installed and tried in an empty folder
 #   make lowest    all tests with the lowest versions setup.py allows, in an environment of its own (.venv-lowest)
 #   make mutants   break the mathematics in 55 places, one at a time: do the tests notice? (about ten minutes)
@@ -19,6 +19,7 @@ PIP_ARGS ?=
 CKPT ?=
 TEST_ARGS ?=
 RESULT_ENVS ?= 256
+SWEEP_ENVS ?= 32
 
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
@@ -60,14 +61,24 @@ check: $(INSTALLED)
 
 POLICY := checkpoints/generalist
 RESULTS := docs/results
+EVALUATE = $(BIN)/eagle evaluate $(POLICY).safetensors --envs $(RESULT_ENVS)
+PLOT = $(BIN)/eagle plot
+# Policies whose embeddings are compared: make results LATENTS="with=A without=B"
+LATENTS ?= $(POLICY).safetensors
 
 results: $(INSTALLED)
-	rm -rf $(RESULTS)/joint $(RESULTS)/single
-	$(BIN)/eagle evaluate $(POLICY).safetensors --protocol joint --envs $(RESULT_ENVS) --out $(RESULTS)/joint
-	$(BIN)/eagle evaluate $(POLICY).safetensors --protocol single --envs $(RESULT_ENVS) --out $(RESULTS)/single
-	$(BIN)/eagle plot response $(POLICY).safetensors --out $(RESULTS)
-	$(BIN)/eagle plot latents $(POLICY).safetensors --out $(RESULTS)
-	$(BIN)/eagle plot curves root=$(RESULTS)/curves/curves_root.csv --smooth 1 --out $(RESULTS)/curves
+	rm -rf $(RESULTS)/joint $(RESULTS)/single $(RESULTS)/standing $(RESULTS)/stopping
+	$(EVALUATE) --protocol joint --out $(RESULTS)/joint
+	$(EVALUATE) --protocol single --out $(RESULTS)/single
+	$(EVALUATE) --protocol standing --out $(RESULTS)/standing
+	$(EVALUATE) --protocol standing --resample 4 --out $(RESULTS)/stopping
+	$(PLOT) estimator $(POLICY).safetensors --envs $(RESULT_ENVS) --out $(RESULTS)
+	$(PLOT) robustness $(POLICY).safetensors --envs $(SWEEP_ENVS) --out $(RESULTS)
+	$(PLOT) bodies $(POLICY).safetensors --envs $(SWEEP_ENVS) --out $(RESULTS)
+	$(PLOT) postures $(POLICY).safetensors --out $(RESULTS)
+	$(PLOT) response $(POLICY).safetensors --out $(RESULTS)
+	$(PLOT) latents $(LATENTS) --out $(RESULTS)
+	$(PLOT) curves root=$(RESULTS)/curves/curves_root.csv --smooth 1 --out $(RESULTS)/curves
 	$(BIN)/python play.py $(POLICY).safetensors --viewer none --contact-sheet $(RESULTS)/demo.png
 	for robot in h1 g1 t1 n1 adam; do $(BIN)/eagle sim2sim $(POLICY).onnx --robot $$robot || exit 1; done > $(RESULTS)/sim2sim.txt
 

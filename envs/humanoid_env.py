@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -74,6 +75,7 @@ class HumanoidEnv(VecEnv):
         device: str = "cpu",
         num_threads: int = 0,
         dtype: torch.dtype = torch.float32,
+        first_env: int = 0,
     ) -> None:
         """Build the pool and reset every environment.
 
@@ -85,6 +87,8 @@ class HumanoidEnv(VecEnv):
             device: where everything but the physics lives.
             num_threads: physics threads, 0 for one per core.
             dtype: precision of the pooled state; observations are always float32.
+            first_env: number each robot's first environment goes by in the random streams, so that a large pool can be
+                simulated in parts that draw what the whole would.
         """
         self.task = task
         self.num_envs = num_envs
@@ -100,12 +104,12 @@ class HumanoidEnv(VecEnv):
             RobotBatch(spec, build_model(spec, task.sim, field), count, task.sim.decimation, num_threads)
             for spec, count in zip(robots, counts, strict=True)
         ]
-        self.pool = PhysicsPool(batches, self.device, dtype)
+        self.pool = PhysicsPool(batches, self.device, dtype, overlap=num_threads != 1)
         nominal = pool_robots(robots, counts, task.control, task.rewards, self.device, dtype)
         self.rng = CounterRng(
             seed,
             [name for name, count in zip(self.robot_names, counts, strict=True) for _ in range(count)],
-            torch.cat([torch.arange(count) for count in counts]).to(self.device),
+            torch.cat([first_env + torch.arange(count) for count in counts]).to(self.device),
         )
         self.randomizer = Randomizer(task.randomization, self.pool, nominal, self.rng)
         self.robots = self.randomizer.robots
@@ -129,7 +133,7 @@ class HumanoidEnv(VecEnv):
         self._all = torch.arange(num_envs, device=self.device)
         self._allocate(dtype)
         self._apply_aids()
-        self._reset(self._all)
+        self.reset()
         self._no_observations = self.get_observations()[:0].clone()
 
     def _allocate(self, dtype: torch.dtype) -> None:
@@ -158,8 +162,9 @@ class HumanoidEnv(VecEnv):
                 absurd, the environment counts as sick.
 
         Returns:
-            Observations after resets, rewards (N,), dones (N,), and extras with ``time_outs``, ``log``, and the true
-            last observations of the environments that timed out (``final_ids``, ``final_observations``).
+            Observations after resets, rewards (N,), dones (N,), and extras with ``time_outs``, ``log``, the true last
+            observations of the environments that timed out (``final_ids``, ``final_observations``), and how long the
+            physics took [s] (``physics_time``).
         """
         self._last_joint_vel, self._last_contact = self.state.joint_vel, self.state.foot_contact
         self._physics_step(self._act(actions))
@@ -180,18 +185,18 @@ class HumanoidEnv(VecEnv):
 
         self._observe()
         final_ids = (dones if self.final_observations_of_falls else time_outs).nonzero().squeeze(1)
-        extras: dict[str, Any] = {"time_outs": time_outs, "final_ids": final_ids}
+        extras: dict[str, Any] = {"time_outs": time_outs, "final_ids": final_ids, "physics_time": self._physics_time}
         extras["final_observations"] = self.get_observations()[final_ids] if len(final_ids) else self._no_observations
         extras["log"] = self._account(terms, reasons, causes, dones, time_outs)
         reset_ids = dones.nonzero().squeeze(1)
         if len(reset_ids):
-            self._reset(reset_ids)
+            self._reset(reset_ids, fallen[reset_ids])
         self._resample()
         return self.get_observations(), rewards.float(), dones, extras
 
     def reset(self) -> None:
         """Start new episodes everywhere; random streams go on."""
-        self._reset(self._all)
+        self._reset(self._all, torch.zeros_like(self._all, dtype=torch.bool))
 
     def get_observations(self) -> TensorDict:
         """Observation groups at the present state, fresh tensors."""
@@ -255,7 +260,9 @@ class HumanoidEnv(VecEnv):
         """Push, help and step every robot."""
         self.randomizer.push(self.common_step_counter, self.penalty_scale, self.step_dt)
         wrench = None if self._harness is None else harness_wrench(self.state, self.robots, self._harness)
+        start = time.perf_counter()
         self._staged = self.pool.step(targets, wrench)
+        self._physics_time = time.perf_counter() - start
 
     def _apply_aids(self) -> None:
         """Spread the aids' scales over the environments, and put the harness' share of the damping in force."""
@@ -307,8 +314,8 @@ class HumanoidEnv(VecEnv):
         self._last_frame = frame
         self.history.push(sensed)
 
-    def _reset(self, ids: Tensor) -> None:
-        """Start new episodes; other environments are untouched, bit for bit."""
+    def _reset(self, ids: Tensor, fallen: Tensor) -> None:
+        """Start new episodes, some of them, bool (n,), after a fall; other environments are untouched, bit for bit."""
         count = self.episode_count[ids]
         self.ground.advance(ids, count, self.state, self.episode_length_buf)
         self.randomizer.reset(ids, count, self.step_dt)
@@ -317,7 +324,7 @@ class HumanoidEnv(VecEnv):
         self.episode_count[ids] += 1
         self.episode_length_buf = self.episode_length_buf.index_fill(0, ids, 0)
         self.phase = self.phase.index_fill(0, ids, 0.0)
-        self.commands.draw(ids)
+        self.commands.renew(ids, fallen)
         for name in ("_actions", "_last_actions", "_last_last_actions", "_last_contact"):
             setattr(self, name, getattr(self, name).index_fill(0, ids, 0))
         self._last_joint_vel = self._last_joint_vel.index_copy(0, ids, staged[:, self.pool.columns["joint_vel"]])
@@ -328,7 +335,7 @@ class HumanoidEnv(VecEnv):
 
     def _resample(self) -> None:
         """Draw new commands where their time is up."""
-        ids = self.commands.due(self.episode_length_buf)
+        ids = self.commands.due()
         if len(ids):
             self.commands.draw(ids)
             self.commands.show(self.state, self.phase, self.task.gait)

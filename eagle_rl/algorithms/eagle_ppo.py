@@ -25,12 +25,16 @@ from torch import Tensor
 from eagle_rl.algorithms.auxiliary import AuxiliaryLosses, Distill, Estimation, Kickstart, Mirror
 from eagle_rl.algorithms.rollout import Rollout
 from eagle_rl.algorithms.specialists import SpecialistBank
+from eagle_rl.algorithms.stopwatch import Stopwatch
 from eagle_rl.config.schema import AlgoCfg
 from eagle_rl.errors import HealthError
 from eagle_rl.models import EagleActor
+from eagle_rl.models.precision import keep_outputs_exact, multiplies_in_bfloat16
 
 MAX_SKIPPED_STEPS = 3
 """Non-finite gradients in a row after which learning stops."""
+MAX_KL_RATIO = 10.0
+"""KL, as a multiple of ``desired_kl``, beyond which a minibatch takes no step [-] (ours)."""
 LEARNING_RATE_FACTOR = 1.5
 """Change of the learning rate per iteration [-] (HugWBC 7)."""
 
@@ -68,9 +72,12 @@ class EaglePPO(PPO):
             max_grad_norm=cfg.max_grad_norm,
             use_clipped_value_loss=cfg.use_clipped_value_loss,
             schedule="fixed",
+            use_mixed_precision=multiplies_in_bfloat16(cfg.precision, device),
             device=device,
             multi_gpu_cfg=multi_gpu_cfg,
         )
+        for model in (actor, critic):
+            keep_outputs_exact(model)
         self.cfg = cfg
         self.is_multi_gpu = True  # makes update() call reduce_parameters(), where gradients are checked
         self.specialists: SpecialistBank | None = None
@@ -78,10 +85,15 @@ class EaglePPO(PPO):
         self.num_updates = 0
         self.skipped_steps = 0
         self._skipped_in_a_row = 0
-        self.symmetry = AuxiliaryLosses([])
-        parameters = [*actor.parameters(), *critic.parameters()]
-        self.optimizer = torch.optim.Adam(parameters, lr=cfg.learning_rate, fused=True)
-        self.optimizer.register_step_post_hook(lambda *_: self._raw_actor.distribution.project_std())
+        self._withheld_steps = 0
+        self.stopwatch = Stopwatch()
+        self.symmetry = AuxiliaryLosses([], self.stopwatch)
+        groups = [
+            {"params": list(actor.parameters()), "lr": cfg.learning_rate},
+            {"params": list(critic.parameters()), "lr": cfg.critic_learning_rate},
+        ]
+        self.optimizer = torch.optim.Adam(groups, fused=True)
+        self.optimizer.register_step_post_hook(lambda *_: self._after_step())
 
     @staticmethod
     def construct_algorithm(obs: TensorDict, env: VecEnv, cfg: dict[str, Any], device: str) -> EaglePPO:
@@ -105,6 +117,11 @@ class EaglePPO(PPO):
             self.symmetry.terms.append(
                 Kickstart(lambda: cfg.kickstart_coef * math.exp(-cfg.kickstart_decay * self.num_updates))
             )
+
+    def act(self, obs: TensorDict) -> Tensor:
+        """Sample actions, computed as the update will compute them, so that its importance ratios start at one."""
+        with torch.autocast(torch.device(self.device).type, torch.bfloat16, self.use_mixed_precision):
+            return super().act(obs)
 
     def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: Mapping[str, Any]) -> None:
         """Record one step; a time-out is bootstrapped with the value of its true final observation."""
@@ -131,14 +148,25 @@ class EaglePPO(PPO):
         kl = self._mean_over_processes(self.symmetry.pop_kl(self.num_mini_batches))
         self._adapt_learning_rate(kl)
         self.num_updates += 1
+        withheld, self._withheld_steps = self._withheld_steps, 0
         scalars = {f"Loss/{name}": value for name, value in losses.items()} | self.symmetry.pop_means()
-        return scalars | {"Loss/kl": kl, "Health/skipped_updates": float(self.skipped_steps)}
+        counts = {"Health/skipped_updates": self.skipped_steps, "Loss/withheld_steps": withheld}
+        return scalars | {"Loss/kl": kl} | {tag: float(count) for tag, count in counts.items()}
 
     def reduce_parameters(self) -> None:
-        """Average the gradients over processes; drop them if they are not finite, so that the step does nothing."""
+        """Average the gradients over processes; drop them, so that the step does nothing, where they do harm.
+
+        That is where they are not finite, and where the policy has already left the region PPO's loss is good for.
+        """
+        self.stopwatch.lap("backward")
         if self.gpu_world_size > 1:
             super().reduce_parameters()
-        grads = [p.grad for p in self.optimizer.param_groups[0]["params"] if p.grad is not None]
+        if self._too_far():
+            self.optimizer.zero_grad(set_to_none=True)
+            self._withheld_steps += 1
+            return
+        parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
+        grads = [p.grad for p in parameters if p.grad is not None]
         if torch.isfinite(torch.nn.utils.get_total_norm(grads)):
             self._skipped_in_a_row = 0
             return
@@ -164,17 +192,27 @@ class EaglePPO(PPO):
             self.learning_rate = loaded_dict["learning_rate"]
             self.num_updates = loaded_dict["counters"]["num_updates"]
             self.skipped_steps = loaded_dict["counters"]["skipped_steps"]
+        self.optimizer.param_groups[1]["lr"] = self.cfg.critic_learning_rate
         return iteration
 
+    def _too_far(self) -> bool:
+        """Whether this update has moved the policy so far from the one that acted that one more step may wreck it."""
+        if not self.cfg.use_ppo_loss:
+            return False
+        return self._mean_over_processes(self.symmetry.last_kl.clone()) > MAX_KL_RATIO * self.cfg.desired_kl
+
+    def _after_step(self) -> None:
+        self._raw_actor.distribution.project_std()
+        self.stopwatch.lap("optimiser")
+
     def _adapt_learning_rate(self, kl: float) -> None:
-        """Lower the learning rate where the policy moved too far in the last epoch, raise it where too little."""
+        """Lower the actor's learning rate where the last epoch moved the policy too far, raise it where too little."""
         low, high = self.cfg.learning_rate_range
         if kl > 2 * self.cfg.desired_kl:
             self.learning_rate = max(low, self.learning_rate / LEARNING_RATE_FACTOR)
         elif 0 < kl < self.cfg.desired_kl / 2:
             self.learning_rate = min(high, self.learning_rate * LEARNING_RATE_FACTOR)
-        for group in self.optimizer.param_groups:
-            group["lr"] = self.learning_rate
+        self.optimizer.param_groups[0]["lr"] = self.learning_rate
 
     def _normalize_over_processes(self) -> None:
         """Give the advantages of all processes together zero mean and unit variance, as one process would."""

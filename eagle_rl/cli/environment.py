@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -12,8 +12,7 @@ from eagle_rl.machine import own_cores
 if TYPE_CHECKING:
     from rsl_rl.env import VecEnv
 
-MakeEnv = Callable[[Sequence[str], int, TaskCfg, int], "VecEnv"]
-"""``(robots, num_envs, task, seed) -> VecEnv``."""
+    from eagle_rl.evaluation.evaluate import MakeEnv
 
 
 def make_env_factory(run: RunCfg) -> MakeEnv:
@@ -25,10 +24,12 @@ def make_env_factory(run: RunCfg) -> MakeEnv:
     return partial(_make_env, run)
 
 
-def _make_env(run: RunCfg, robots: Sequence[str], num_envs: int, task: TaskCfg, seed: int) -> VecEnv:
+def _make_env(
+    run: RunCfg, robots: Sequence[str], num_envs: int, task: TaskCfg, seed: int, first_env: int = 0
+) -> VecEnv:
     from envs.humanoid_env import HumanoidEnv
     from envs.robots.load import load_robot
 
     specs = [load_robot(name) for name in robots]
     threads = run.num_threads or own_cores()
-    return HumanoidEnv(task, specs, num_envs, seed, device=run.device, num_threads=threads)
+    return HumanoidEnv(task, specs, num_envs, seed, device=run.device, num_threads=threads, first_env=first_env)

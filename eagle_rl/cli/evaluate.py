@@ -43,8 +43,15 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--robots", metavar="A,B", help="robots to judge on, or all [those it was trained on]")
     parser.add_argument("--envs", type=count, metavar="N", help="environments per robot [the experiment's]")
     parser.add_argument("--steps", type=count, metavar="N", help="control steps [the experiment's, 1000 in the paper]")
-    parser.add_argument("--protocol", choices=("single", "joint"), help="draw one command at a time, or all five")
-    parser.add_argument("--resample", type=seconds, metavar="S", help="redraw commands every S seconds, 0 never")
+    parser.add_argument(
+        "--protocol", choices=("single", "joint", "standing"), help="draw one command, all five, or posture"
+    )
+    parser.add_argument(
+        "--resample",
+        type=seconds,
+        metavar="S",
+        help="redraw commands every S seconds, 0 never; standing: walk by turns",
+    )
     parser.add_argument("--seed", type=int, metavar="N", help="seed of commands and randomization")
     parser.add_argument("--randomize", action="store_true", help="randomized dynamics, with pushes")
     parser.add_argument("--noise", action="store_true", help="sensor noise")
@@ -102,7 +109,12 @@ def _judge(name: str, policy: Policy, ev: EvaluationCfg, robots: Sequence[str], 
         bar = progress.add_task(name, total=len(robots) * ev.num_envs_per_robot * ev.num_steps)
         scores = evaluate(policy.actor, make_env, robots, cfg.task, ev, on_step=lambda n: progress.advance(bar, n))
     return EvaluationResult(
-        checkpoint=policy.sha256, protocol=ev, robots=scores, seed=cfg.seed, env_steps=policy.env_steps
+        checkpoint=policy.sha256,
+        protocol=ev,
+        robots=scores,
+        seed=cfg.seed,
+        env_steps=policy.env_steps,
+        unseen=tuple(robot for robot in robots if robot not in cfg.robots),
     )
 
 

@@ -89,7 +89,7 @@ def _load(args: argparse.Namespace, checkpoint: Path, seconds: float) -> Session
     """The policy and its robots, ready to move."""
     from .session import Session
 
-    policy = load_policy(checkpoint, threads=1)
+    policy = load_policy(checkpoint)
     names = chosen_robots(args.robots, policy.cfg)
     return Session(policy.actor, policy.cfg, names, num_steps=round(seconds / CONTROL_STEP))
 

@@ -5,24 +5,31 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from eagle_rl.config.schema import EvaluationCfg, ExperimentCfg, ObservationsCfg
 from eagle_rl.errors import ConfigError
 
 from .arguments import count, device, require_folder
-from .policy import chosen_robots, load_policy
+from .environment import make_env_factory
+from .policy import Policy, chosen_robots, load_policy
 
 if TYPE_CHECKING:
+    from eagle_rl.evaluation.estimator import Channel
     from eagle_rl.evaluation.plots import Figure
+    from eagle_rl.evaluation.robustness import Sweep
 
 FIGURES = {
     "curves": "learning curves per robot of a run's stages",
     "rounds": "tracking errors over rounds, specialists and generalists marked",
     "latents": "t-SNE of e(s_t) of walking robots, silhouette score and linear probe, one panel per checkpoint",
     "response": "commanded and measured traces of all five commands",
-    "robustness": "survival and errors under pushes, low friction, payload, latency and other masses",
+    "robustness": "survival and errors under pushes, friction, payload and latency",
+    "bodies": "survival and errors of bodies of other sizes, masses and proportions, further and further away",
+    "estimator": "explained variance of base velocity and o_ea on randomized robots; also md, csv, json",
+    "postures": "pictures of a squat and a lean of every robot",
 }
 
 
@@ -45,7 +52,9 @@ def _parser() -> argparse.ArgumentParser:
         "--device", type=device, default="cpu", metavar="cpu|cuda", help="where the policy computes [cpu]"
     )
     parser.add_argument("--envs", type=count, default=16, metavar="N", help="environments per robot [16]")
-    parser.add_argument("--steps", type=count, default=500, metavar="N", help="control steps of robustness runs [500]")
+    parser.add_argument(
+        "--steps", type=count, default=500, metavar="N", help="control steps of robustness, bodies, estimator [500]"
+    )
     parser.add_argument("--smooth", type=count, default=10, metavar="N", help="iterations averaged in curves [10]")
     return parser
 
@@ -79,27 +88,41 @@ def _curves(args: argparse.Namespace) -> dict[str, Figure]:
 
 
 def _rounds(args: argparse.Namespace) -> dict[str, Figure]:
+    """One figure per run, or file of its scores; the scores as csv."""
     from eagle_rl.evaluation import plots
-    from eagle_rl.evaluation.curves import read_rounds
+    from eagle_rl.evaluation.curves import read_rounds, rounds_from_csv, rounds_to_csv
     from eagle_rl.runners.judged import judged_stages
     from eagle_rl.runners.records import read_plan
 
     figures = {}
-    for name, run in map(_named, args.paths):
-        judged = [(stage.round, stage.specialised, file) for stage, file in judged_stages(run, read_plan(run))]
-        figures[name] = plots.error_rounds(read_rounds(judged))
+    for name, path in map(_named, args.paths):
+        if path.suffix == ".csv":
+            scores = rounds_from_csv(path)
+        else:
+            judged = judged_stages(path, read_plan(path))
+            scores = read_rounds([(stage.round, stage.specialised, file) for stage, file in judged])
+        figures[name] = plots.error_rounds(scores)
+        _write(args.out / f"rounds_{name}.csv", rounds_to_csv(scores))
     return figures
+
+
+def _policies(args: argparse.Namespace) -> Iterator[tuple[str, Policy, tuple[str, ...]]]:
+    """Name, policy and robots to show of each checkpoint."""
+    for name, path in map(_named, args.paths):
+        policy = load_policy(path, args.device)
+        yield name, policy, chosen_robots(args.robots, policy.cfg)
+
+
+def _protocol(args: argparse.Namespace, cfg: ExperimentCfg) -> EvaluationCfg:
+    return dataclasses.replace(cfg.evaluation, num_envs_per_robot=args.envs, num_steps=args.steps)
 
 
 def _latents(args: argparse.Namespace) -> dict[str, Figure]:
     from eagle_rl.evaluation import latents, plots
 
-    from .environment import make_env_factory
-
     maps, numbers = {}, {}
-    for name, path in map(_named, args.paths):
-        policy = load_policy(path, args.device)
-        cfg, robots = policy.cfg, chosen_robots(args.robots, policy.cfg)
+    for name, policy, robots in _policies(args):
+        cfg = policy.cfg
         make_env = make_env_factory(cfg.run)
         found = latents.collect_embeddings(policy.actor, make_env, robots, cfg.task, cfg.evaluation, num_envs=args.envs)
         scores = latents.silhouette(found), latents.probe_accuracy(found)
@@ -113,37 +136,91 @@ def _response(args: argparse.Namespace) -> dict[str, Figure]:
     from eagle_rl.evaluation import plots
     from eagle_rl.evaluation.response import command_responses
 
-    from .environment import make_env_factory
-
     figures = {}
-    for name, path in map(_named, args.paths):
-        policy = load_policy(path, args.device)
-        cfg, robots = policy.cfg, chosen_robots(args.robots, policy.cfg)
+    for name, policy, robots in _policies(args):
+        cfg = policy.cfg
         traces = command_responses(policy.actor, make_env_factory(cfg.run), robots, cfg.task, cfg.evaluation)
         figures[name] = plots.responses(traces)
     return figures
 
 
 def _robustness(args: argparse.Namespace) -> dict[str, Figure]:
-    from eagle_rl.evaluation import plots
-    from eagle_rl.evaluation.robustness import SWEEPS, sweep
+    from eagle_rl.evaluation.robustness import DISTURBANCES
 
-    from .environment import make_env_factory
+    return _swept(args, DISTURBANCES)
+
+
+def _bodies(args: argparse.Namespace) -> dict[str, Figure]:
+    from eagle_rl.evaluation.robustness import BODIES
+
+    return _swept(args, BODIES)
+
+
+def _swept(args: argparse.Namespace, sweeps: Mapping[str, Sweep]) -> dict[str, Figure]:
+    """Every sweep side by side; the numbers as json."""
+    from eagle_rl.evaluation import plots
+    from eagle_rl.evaluation.robustness import sweep
 
     figures = {}
-    for name, path in map(_named, args.paths):
-        policy = load_policy(path, args.device)
-        cfg, robots = policy.cfg, chosen_robots(args.robots, policy.cfg)
-        ev = dataclasses.replace(cfg.evaluation, num_envs_per_robot=args.envs, num_steps=args.steps)
-        make_env = make_env_factory(cfg.run)
-        scores = {kind: sweep(policy.actor, make_env, robots, cfg.task, ev, kind) for kind in SWEEPS}
-        figures[name] = plots.robustness((SWEEPS[kind], scores[kind]) for kind in SWEEPS)
+    for name, policy, robots in _policies(args):
+        cfg, make_env = policy.cfg, make_env_factory(policy.cfg.run)
+        ev = _protocol(args, cfg)
+        scores = {
+            kind: sweep(policy.actor, make_env, robots, cfg.task, ev, through) for kind, through in sweeps.items()
+        }
+        figures[name] = plots.robustness((sweeps[kind], scores[kind]) for kind in sweeps)
         plain = {
             kind: {str(v): {r: dataclasses.asdict(m) for r, m in scored.items()} for v, scored in by_value.items()}
             for kind, by_value in scores.items()
         }
-        _write_numbers(args.out / f"robustness_{name}.json", plain)
+        _write_numbers(args.out / f"{args.figure}_{name}.json", plain)
     return figures
+
+
+def _estimator(args: argparse.Namespace) -> dict[str, Figure]:
+    from eagle_rl.evaluation import plots
+    from eagle_rl.evaluation.estimator import judge_estimator
+    from eagle_rl.evaluation.estimator_report import describe, to_csv, to_markdown
+
+    figures = {}
+    for name, policy, robots in _policies(args):
+        cfg, ev = policy.cfg, _protocol(args, policy.cfg)
+        channels = estimate_channels(cfg.task.observations)
+        report = judge_estimator(policy.actor, make_env_factory(cfg.run), robots, cfg.task, ev, channels)
+        figures[name] = plots.estimator_bars(report)
+        table = to_markdown(report, describe(args.envs, args.steps, ev.seed, policy.sha256))
+        print(table)
+        _write(args.out / f"estimator_{name}.md", table)
+        _write(args.out / f"estimator_{name}.csv", to_csv(report))
+        protocol = {"checkpoint": policy.sha256, "protocol": dataclasses.asdict(ev)}
+        _write_numbers(args.out / f"estimator_{name}.json", protocol | dataclasses.asdict(report))
+    return figures
+
+
+def estimate_channels(cfg: ObservationsCfg) -> tuple[Channel, ...]:
+    """What the estimator's columns hold: base velocity and, if it is on, the paper's o_ea."""
+    from eagle_rl.evaluation.estimator import Channel
+    from envs.robots.embodiment import EMBODIMENT_LINKS, LINK_CHANNELS, reference_statistics
+
+    channels = tuple(Channel(name=f"base v_{axis}", unit="m/s", scale=1.0 / cfg.scales.base_lin_vel) for axis in "xyz")
+    if not cfg.embodiment_observation:
+        return channels
+    names = [(f"{link.replace('_', ' ')} {name}", unit) for link in EMBODIMENT_LINKS for name, unit in LINK_CHANNELS]
+    spread = reference_statistics()[1].tolist()
+    bodies = (Channel(name=name, unit=unit, scale=std) for (name, unit), std in zip(names, spread, strict=True))
+    return (*channels, *bodies)
+
+
+def _postures(args: argparse.Namespace) -> dict[str, Figure]:
+    from eagle_rl.evaluation import plots
+
+    from .postures import POSTURES, strips
+
+    return {
+        f"{posture}_{name}": plots.film_strips(strips(policy, robots, posture))
+        for name, policy, robots in _policies(args)
+        for posture in POSTURES
+    }
 
 
 def _write_numbers(path: Path, numbers: object) -> None:
@@ -162,6 +239,9 @@ DRAW: dict[str, Callable[[argparse.Namespace], dict[str, Figure]]] = {
     "latents": _latents,
     "response": _response,
     "robustness": _robustness,
+    "bodies": _bodies,
+    "estimator": _estimator,
+    "postures": _postures,
 }
 """Each returns its figures by the name of what they show."""
 

@@ -31,16 +31,14 @@ class Policy:
     """What it has cost, if known."""
 
 
-def load_policy(path: Path, device: str = "cpu", threads: int | None = None) -> Policy:
+def load_policy(path: Path, device: str = "cpu") -> Policy:
     """The policy a path means.
 
     Args:
         path: checkpoint, stage, run or published policy.
         device: where it computes, whatever it was trained on.
-        threads: of torch; None takes the experiment's.
     """
     from eagle_rl.config.load import experiment_from_plain
-    from eagle_rl.machine import own_cores
     from eagle_rl.models.precision import set_up_torch
     from eagle_rl.runners.checkpoint import load_actor
     from eagle_rl.runners.judged import training_steps
@@ -53,7 +51,7 @@ def load_policy(path: Path, device: str = "cpu", threads: int | None = None) -> 
     checkpoint = find_checkpoint(path)
     actor, manifest = load_actor(checkpoint, device, slot_table_hash(SLOT_NAMES))
     cfg = experiment_from_plain(manifest["config"], str(checkpoint))
-    set_up_torch(threads or cfg.run.torch_threads or own_cores())
+    set_up_torch(1)  # a forward pass is little beside the physics, and waiting threads take the cores from it
     cfg = dataclasses.replace(cfg, run=dataclasses.replace(cfg.run, device=device))
     env_steps = manifest["env_steps"] if checkpoint.suffix == SUFFIX else training_steps(checkpoint)
     return Policy(checkpoint, actor, cfg, manifest["sha256"], env_steps)

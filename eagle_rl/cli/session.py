@@ -55,6 +55,11 @@ class Session:
         """Root position [m], quaternion (w, x, y, z) and joint angles [rad] of each robot."""
         return [batch.qpos[0] for batch in self._env.pool.batches]
 
+    @property
+    def measured(self) -> Array:
+        """What each command asks for, as it is [m/s, m/s, rad/s, m, rad], shape (num_robots, 5)."""
+        return self._env.measured_commands().double().numpy()
+
     @torch.inference_mode()
     def step(self, command: Array) -> None:
         """Advance one control step under a command for all, shape (5,)."""

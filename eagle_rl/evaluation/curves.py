@@ -12,6 +12,7 @@ from pathlib import Path
 
 from eagle_rl.errors import ConfigError
 from eagle_rl.evaluation.evaluate import EvaluationResult
+from eagle_rl.evaluation.protocol import COMMANDS
 
 STEPS = "Perf/env_steps"
 LEARNING_TAGS = {
@@ -117,3 +118,26 @@ def read_rounds(stages: Sequence[tuple[int, bool, Path]]) -> list[RoundScores]:
     if not scores:
         raise ConfigError("No stage of the run has been judged: plan.judge_envs_per_robot is 0, or none is done yet.")
     return scores
+
+
+def rounds_to_csv(scores: Sequence[RoundScores]) -> str:
+    """The numbers behind the rounds, one line per robot and policy; :func:`rounds_from_csv` reads them back."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["robot", "specialist", "position", *COMMANDS])
+    writer.writerows([s.robot, int(s.specialist), s.position, *(f"{e:.5g}" for e in s.errors)] for s in scores)
+    return text.getvalue()
+
+
+def rounds_from_csv(path: Path) -> list[RoundScores]:
+    """What :func:`rounds_to_csv` wrote."""
+    with path.open(encoding="utf-8", newline="") as file:
+        return [
+            RoundScores(
+                robot=row["robot"],
+                specialist=row["specialist"] == "1",
+                position=float(row["position"]),
+                errors=tuple(float(row[name]) for name in COMMANDS),
+            )
+            for row in csv.DictReader(file)
+        ]

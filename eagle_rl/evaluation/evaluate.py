@@ -16,7 +16,7 @@ from torch import Tensor
 from eagle_rl.config.schema import EvaluationCfg, TaskCfg
 from eagle_rl.errors import CheckpointError
 from eagle_rl.evaluation.metrics import SETTLING_TIME_S, RobotMetrics, TrackingAccumulator
-from eagle_rl.evaluation.protocol import draw_commands, evaluation_task, step_dt, steps_per_draw, varied_commands
+from eagle_rl.evaluation.protocol import draw_commands, evaluation_task, judged_commands, step_dt, steps_per_draw
 
 FORMAT = 1
 """Version of the JSON an evaluation is stored as."""
@@ -47,8 +47,11 @@ class TrackingEnv(Protocol):
         """Absolute errors of the last step, before any reset, shape (N, 5)."""
 
 
-MakeEnv = Callable[[Sequence[str], int, TaskCfg, int], Any]
-"""Builds an environment from robot names, number of environments, task and seed."""
+class MakeEnv(Protocol):
+    """Builds environments; ``first_env`` is the number each robot's first one goes by in the random streams."""
+
+    def __call__(self, robots: Sequence[str], num_envs: int, task: TaskCfg, seed: int, first_env: int = 0, /) -> Any:
+        """So many environments over all these robots: a TrackingEnv to an evaluation, a VecEnv to a learner."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,6 +66,8 @@ class EvaluationResult:
     """Seed of the training run."""
     env_steps: int | None = None
     """Environment steps the policy has cost, if known."""
+    unseen: tuple[str, ...] = ()
+    """Robots the policy was not trained on."""
 
     def to_json(self) -> str:
         """One JSON document."""
@@ -80,6 +85,7 @@ class EvaluationResult:
             robots={name: RobotMetrics.from_dict(robot) for name, robot in data["robots"].items()},
             seed=data["seed"],
             env_steps=data["env_steps"],
+            unseen=tuple(data.get("unseen", ())),
         )
 
     @classmethod
@@ -112,8 +118,7 @@ def evaluate(
         robots: robots to judge.
         task: the task it was trained in; the protocol makes it an evaluation.
         ev: the protocol.
-        chunk_envs: environments simulated together, rounded up to whole tiles; changes memory, not the result. (With
-            ``ev.randomization`` or ``ev.noise`` each chunk draws from a seed of its own, so the draws do depend on it.)
+        chunk_envs: environments simulated together, rounded up to whole tiles; changes memory, not the result.
         on_step: told after every control step how many environment steps were made.
     """
     task = evaluation_task(task, ev)
@@ -121,12 +126,12 @@ def evaluate(
     metrics = {}
     for robot in robots:
         commands = draw_commands(task.commands, ev, robot, ev.num_envs_per_robot)
-        varied = varied_commands(ev, ev.num_envs_per_robot)
+        judged = judged_commands(ev, ev.num_envs_per_robot)
         parts = []
         for start in range(0, ev.num_envs_per_robot, size):
             chunk = commands[start : start + size]
-            env = make_env([robot], len(chunk), task, ev.seed + start)
-            accumulator = TrackingAccumulator(varied[start : start + size])
+            env = make_env([robot], len(chunk), task, ev.seed, start)
+            accumulator = TrackingAccumulator(judged[start : start + size])
             parts.append(_run_chunk(policy, env, chunk, accumulator, task, ev, on_step))
         metrics[robot] = TrackingAccumulator.join(parts).finish()
     return metrics

@@ -76,15 +76,15 @@ def _mean(total: Tensor, steps: Tensor) -> tuple[float | None, ...]:
 class TrackingAccumulator:
     """Sums of absolute errors of N environments of one robot."""
 
-    def __init__(self, varied: Tensor) -> None:
+    def __init__(self, judged: Tensor) -> None:
         """Start with nobody fallen.
 
         Args:
-            varied: commands on which each environment is judged, bool, shape (N, 5).
+            judged: commands on which each environment is judged, bool, shape (N, 5).
         """
-        shape = (len(varied), len(SUBSETS), len(COMMANDS))
-        self.varied = varied
-        self.alive = torch.ones(len(varied), dtype=torch.bool)
+        shape = (len(judged), len(SUBSETS), len(COMMANDS))
+        self.judged = judged
+        self.alive = torch.ones(len(judged), dtype=torch.bool)
         self.error, self.steps, self.charge, self.commanded = torch.zeros(4, *shape, dtype=torch.float64)
 
     def add(self, errors: Tensor, command: Tensor, fell: Tensor, settled: bool) -> None:
@@ -97,7 +97,7 @@ class TrackingAccumulator:
             settled: whether the command is at least SETTLING_TIME_S old.
         """
         self.alive &= ~fell
-        judged = subset_members(command, settled).unsqueeze(2) & self.varied.unsqueeze(1)
+        judged = subset_members(command, settled).unsqueeze(2) & self.judged.unsqueeze(1)
         upright = judged & self.alive[:, None, None]
         absent = (judged & ~upright) * command.abs().double().unsqueeze(1)
         counted = torch.where(upright, errors.double().unsqueeze(1), 0.0)
@@ -128,7 +128,7 @@ class TrackingAccumulator:
     @staticmethod
     def join(parts: list[TrackingAccumulator]) -> TrackingAccumulator:
         """One accumulator of the environments of several, in their order."""
-        joined = TrackingAccumulator(torch.cat([part.varied for part in parts]))
+        joined = TrackingAccumulator(torch.cat([part.judged for part in parts]))
         for name in ("alive", "error", "steps", "charge", "commanded"):
             setattr(joined, name, torch.cat([getattr(part, name) for part in parts]))
         return joined

@@ -9,8 +9,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Figure  # re-exported, so that only this module names matplotlib
 from numpy.typing import NDArray
+from PIL import Image
 
 from eagle_rl.evaluation.curves import Curve, RoundScores
+from eagle_rl.evaluation.estimator import ChannelScore, EstimatorReport
 from eagle_rl.evaluation.latents import Embeddings
 from eagle_rl.evaluation.metrics import RobotMetrics
 from eagle_rl.evaluation.reference import STAND_STILL
@@ -42,12 +44,14 @@ def _legend(figure: Figure, ax: Axes, columns: int) -> None:
 
 
 def save(figure: Figure, folder: Path, name: str) -> list[Path]:
-    """Write a figure as PNG and PDF; the paths."""
+    """Write a figure as PNG, of 256 colours to keep it small, and PDF; the paths."""
     folder.mkdir(parents=True, exist_ok=True)
-    paths = [folder / f"{name}.{suffix}" for suffix in ("png", "pdf")]
-    for path in paths:
-        figure.savefig(path, dpi=200)
-    return paths
+    png, pdf = (folder / f"{name}.{suffix}" for suffix in ("png", "pdf"))
+    figure.savefig(pdf, dpi=150)  # of pictures in it; lines have none
+    figure.savefig(png, dpi=200)
+    with Image.open(png) as picture:
+        picture.convert("RGB").quantize(256, dither=Image.Dither.NONE).save(png, optimize=True)
+    return [png, pdf]
 
 
 def learning_curves(panels: Mapping[str, Sequence[Curve]]) -> Figure:
@@ -156,3 +160,51 @@ def _relative(metrics: RobotMetrics) -> float:
     """Mean charged error of one robot as a share of standing still."""
     charged = metrics.subsets["all"].charged
     return float(np.mean([e / floor for e, floor in zip(charged, STAND_STILL, strict=True) if e is not None]))
+
+
+def estimator_bars(report: EstimatorReport, floor: float = -0.5) -> Figure:
+    """Explained variance of each channel: bars over the fleet and within robots, a marker for each robot.
+
+    What is below ``floor``, an estimate that errs more than the target varies, is drawn there.
+    """
+    figure, axes = _panels(1, 1, width=10.0, height=4.2)
+    ax, place = axes[0, 0], np.arange(len(report.channels))
+    for shift, label, scores, colour in (
+        (-0.2, "fleet", report.fleet, "0.78"),
+        (0.2, "within robots", report.within, "0.5"),
+    ):
+        ax.bar(place + shift, _explained(scores, floor), 0.4, color=colour, label=label)
+    colours = _palette(report.robots)
+    for i, (robot, scores) in enumerate(report.robots.items()):
+        style = {"color": colours[robot], "marker": MARKERS[i % 7], "markersize": 4, "linestyle": "none"}
+        shift = 0.2 + 0.07 * (i - 0.5 * (len(colours) - 1))
+        ax.plot(place + shift, _explained(scores, floor), label=robot, clip_on=False, **style)
+    ax.set_xticks(place, [channel.name for channel in report.channels], rotation=60, ha="right", fontsize=8)
+    ax.set_xlim(-0.6, len(place) - 0.4)
+    ax.set_ylim(floor, 1.02)
+    ax.axhline(0.0, color="black", linewidth=0.8)
+    ax.set_ylabel("explained variance [-]", fontsize=9)
+    ax.grid(axis="x", visible=False)
+    _legend(figure, ax, len(colours) + 2)
+    return figure
+
+
+def _explained(scores: Sequence[ChannelScore], floor: float) -> NDArray[np.float64]:
+    """Explained variances, not below ``floor``; NaN where there is none."""
+    return np.array([np.nan if score.explained is None else max(floor, score.explained) for score in scores])
+
+
+def film_strips(strips: Mapping[str, Sequence[tuple[NDArray[np.uint8], str]]]) -> Figure:
+    """Pictures over time, one row per robot, each with a line of text above it."""
+    columns = max(len(strip) for strip in strips.values())
+    height, width, _ = next(iter(strips.values()))[0][0].shape
+    figure, axes = _panels(len(strips), columns, width=1.7, height=1.7 * height / width + 0.35)
+    for row, (robot, strip) in zip(axes, strips.items(), strict=True):
+        for ax, (picture, text) in zip(row, strip, strict=True):
+            ax.imshow(picture)
+            ax.set_title(text, fontsize=7.5)
+            ax.set(xticks=[], yticks=[])
+            ax.grid(visible=False)
+            ax.spines[:].set_visible(False)
+        row[0].set_ylabel(robot, fontsize=10)
+    return figure

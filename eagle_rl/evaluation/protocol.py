@@ -19,6 +19,8 @@ from eagle_rl.config.schema import CommandsCfg, EvaluationCfg, TaskCfg, TerrainC
 
 COMMANDS = ("lin_vel_x", "lin_vel_y", "ang_vel_z", "base_height", "body_pitch")
 """Names of the five commands in their order in every (..., 5) tensor."""
+NUM_VELOCITIES = 3
+"""The first three are velocities, all zero where a robot is to stand; the others are postures."""
 
 
 def step_dt(task: TaskCfg) -> float:
@@ -52,23 +54,41 @@ def steps_per_draw(ev: EvaluationCfg) -> int:
     return max(1, round(ev.resampling_time_s / (ev.physics_dt * ev.decimation)))
 
 
-def varied_commands(ev: EvaluationCfg, num_envs: int) -> Tensor:
-    """Which commands of each environment are drawn and judged, bool, shape (num_envs, 5).
+def num_draws(ev: EvaluationCfg) -> int:
+    """Commands an environment is given in turn."""
+    return math.ceil(ev.num_steps / steps_per_draw(ev))
 
-    ``single`` gives environment i the dimension i mod 5, ``joint`` all five.
+
+def judged_commands(ev: EvaluationCfg, num_envs: int) -> Tensor:
+    """Which errors of each environment count, bool, shape (num_envs, 5).
+
+    ``single`` judges environment i on the dimension i mod 5, the others judge all five; while a robot stands, its
+    errors of velocity are the speed at which it drifts.
     """
-    if ev.protocol == "joint":
-        return torch.ones(num_envs, len(COMMANDS), dtype=torch.bool)
-    return torch.arange(num_envs).unsqueeze(1) % len(COMMANDS) == torch.arange(len(COMMANDS))
+    if ev.protocol == "single":
+        return torch.arange(num_envs).unsqueeze(1) % len(COMMANDS) == torch.arange(len(COMMANDS))
+    return torch.ones(num_envs, len(COMMANDS), dtype=torch.bool)
+
+
+def drawn_commands(ev: EvaluationCfg, num_envs: int) -> Tensor:
+    """Which commands are not zero, by draw, bool, shape (num_envs, draws, 5).
+
+    ``standing`` keeps the velocities at zero; with redraws, in every second draw, so that at any time half of the
+    environments walk, and all of them stop and start.
+    """
+    drawn = judged_commands(ev, num_envs).unsqueeze(1).repeat(1, num_draws(ev), 1)
+    if ev.protocol == "standing":
+        turn = torch.arange(num_envs).unsqueeze(1) + torch.arange(num_draws(ev))
+        drawn[..., :NUM_VELOCITIES] = ((turn % 2 == 1) & (num_draws(ev) > 1)).unsqueeze(2)
+    return drawn
 
 
 def draw_commands(commands: CommandsCfg, ev: EvaluationCfg, robot: str, num_envs: int) -> Tensor:
     """Commands of one robot's environments, shape (num_envs, draws, 5), float64.
 
-    One draw lasts ``steps_per_draw`` control steps; commands that are not varied are zero.
+    One draw lasts ``steps_per_draw`` control steps; see ``drawn_commands`` for which are zero.
     """
-    draws = math.ceil(ev.num_steps / steps_per_draw(ev))
     generator = np.random.default_rng([ev.seed, zlib.crc32(robot.encode())])
-    unit = torch.from_numpy(generator.random((num_envs, draws, len(COMMANDS))))
+    unit = torch.from_numpy(generator.random((num_envs, num_draws(ev), len(COMMANDS))))
     low, high = torch.tensor([getattr(commands, name).finishing for name in COMMANDS], dtype=torch.float64).T
-    return (low + (high - low) * unit) * varied_commands(ev, num_envs).unsqueeze(1)
+    return (low + (high - low) * unit) * drawn_commands(ev, num_envs)

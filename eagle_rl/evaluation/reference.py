@@ -8,6 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from eagle_rl.config.schema import EvaluationCfg
+from eagle_rl.evaluation.protocol import num_draws
+
 Errors = tuple[float, float, float, float, float]
 
 STAND_STILL: Errors = (0.50, 0.20, 0.50, 0.15, 0.2125)
@@ -16,7 +19,21 @@ STAND_STILL: Errors = (0.50, 0.20, 0.50, 0.15, 0.2125)
 BEST_CONSTANT: Errors = (0.45, 0.20, 0.50, 0.075, 0.20)
 """Errors of the best behaviour that does not depend on the command: the middle of every range."""
 
-FLOORS: Mapping[str, Errors] = {"stand still": STAND_STILL, "best constant": BEST_CONSTANT}
+
+def floors(ev: EvaluationCfg) -> dict[str, Errors]:
+    """What robots that ignore their command score in a protocol.
+
+    Where half of the draws have no velocity, the best constant velocity is zero too.
+    """
+    if ev.protocol != "standing":
+        return {"stand still": STAND_STILL, "best constant": BEST_CONSTANT}
+    walking = 0.5 if num_draws(ev) > 1 else 0.0
+    v_x, v_y, omega = (walking * error for error in STAND_STILL[:3])
+    return {
+        "stand still": (v_x, v_y, omega, *STAND_STILL[3:]),
+        "best constant": (v_x, v_y, omega, *BEST_CONSTANT[3:]),
+    }
+
 
 PAPER: Mapping[str, Mapping[str, Errors]] = {
     "PPO": {

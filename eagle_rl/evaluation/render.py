@@ -39,6 +39,11 @@ def _best(table: Table) -> set[tuple[str, str, int]]:
     return best
 
 
+def method_name(row: Row) -> str:
+    """The method, and whether it met the robot for the first time."""
+    return f"{row.method} (unseen)" if row.unseen else row.method
+
+
 def _percent(cell: Cell | None) -> str:
     return "-" if cell is None or cell.mean is None else f"{100 * cell.mean:.1f} %"
 
@@ -64,12 +69,20 @@ def to_markdown(table: Table) -> str:
             f"**{_text(cell)}**" if (row.robot, row.method, d) in best else _text(cell)
             for d, cell in enumerate(row.cells)
         ]
-        cells = [row.robot, row.method, *errors, _percent(row.survival), str(len(row.seeds) or "-"), _millions(row)]
+        cells = [
+            row.robot,
+            method_name(row),
+            *errors,
+            _percent(row.survival),
+            str(len(row.seeds) or "-"),
+            _millions(row),
+        ]
         lines.append("| " + " | ".join(cells) + " |")
     hashes = [f"- {method}: {', '.join(h[:12] for h in hashes)}" for method, hashes in table.checkpoints.items()]
     note = (
         "Bold: the lowest of a robot's judged methods. In brackets: the paper's number. "
-        "± is the standard deviation over training seeds. M steps: millions of environment steps a seed has cost."
+        "± is the standard deviation over training seeds. M steps: millions of environment steps a seed has cost. "
+        "Unseen: the method was not trained on this robot."
     )
     return "\n".join([*lines, "", table.caption, note, "", "Checkpoints (sha256):", "", *hashes, ""])
 
@@ -80,12 +93,20 @@ def to_csv(table: Table) -> str:
     writer = csv.writer(text, lineterminator="\n")
     kinds = ("", "_std", "_paper")
     writer.writerow(
-        ["robot", "method", *(s + kind for s in SYMBOLS for kind in kinds), "survival", "num_seeds", "env_steps"]
+        [
+            "robot",
+            "method",
+            "unseen",
+            *(s + kind for s in SYMBOLS for kind in kinds),
+            "survival",
+            "num_seeds",
+            "env_steps",
+        ]
     )
     for row in table.rows:
         values = [value for cell in row.cells for value in (cell.mean, cell.std, cell.paper)]
         survival = row.survival.mean if row.survival else None
-        writer.writerow([row.robot, row.method, *values, survival, len(row.seeds), row.env_steps])
+        writer.writerow([row.robot, row.method, row.unseen, *values, survival, len(row.seeds), row.env_steps])
     return text.getvalue()
 
 
@@ -110,7 +131,7 @@ def to_latex(table: Table) -> str:
             lines.append(r"\midrule")
         cells = [_latex(_text(cell, "@").replace("@", r" $\pm$ ")) for cell in row.cells]
         name = _latex(row.robot) if row.robot != robot else ""
-        lines.append(" & ".join([name, _latex(row.method), *cells, _latex(_percent(row.survival))]) + r" \\")
+        lines.append(" & ".join([name, _latex(method_name(row)), *cells, _latex(_percent(row.survival))]) + r" \\")
         robot = row.robot
     return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", r"\end{table}", ""])
 

@@ -11,8 +11,8 @@ from eagle_rl.config.schema import EvaluationCfg
 from eagle_rl.errors import ConfigError
 from eagle_rl.evaluation.evaluate import EvaluationResult
 from eagle_rl.evaluation.metrics import RobotMetrics
-from eagle_rl.evaluation.protocol import COMMANDS
-from eagle_rl.evaluation.reference import FLOORS, PAPER, PAPER_H1, STAND_STILL, Errors
+from eagle_rl.evaluation.protocol import COMMANDS, num_draws
+from eagle_rl.evaluation.reference import PAPER, PAPER_H1, STAND_STILL, Errors, floors
 
 Falls = Literal["charged", "errors"]
 """``charged`` counts |c_d| for every step after a fall, ``errors`` leaves those steps out."""
@@ -35,6 +35,8 @@ class Row:
     robot: str
     method: str
     cells: tuple[Cell, ...]
+    unseen: bool = False
+    """Whether the method was not trained on the robot."""
     survival: Cell | None = None
     seeds: tuple[int, ...] = ()
     """Training seeds; empty for a reference row."""
@@ -73,9 +75,18 @@ def _over_seeds(values: Sequence[float | None], paper: float | None = None) -> C
     )
 
 
+_DRAWN = {
+    "single": "one command drawn, the others zero",
+    "joint": "all five commands drawn",
+    "standing": "velocities exactly zero, so that their errors are drift, height and pitch drawn",
+}
+
+
 def describe(ev: EvaluationCfg, subset: str, falls: Falls) -> str:
     """The protocol in words."""
-    drawn = "one command drawn, the others zero" if ev.protocol == "single" else "all five commands drawn"
+    drawn = _DRAWN[ev.protocol]
+    if ev.protocol == "standing" and num_draws(ev) > 1:
+        drawn += " in every second draw, all five drawn in the others"
     held = f"redrawn every {ev.resampling_time_s:g} s" if ev.resampling_time_s > 0 else "kept for the episode"
     dynamics = "randomized dynamics and pushes" if ev.randomization else "nominal dynamics"
     after = "steps after a fall are charged |c_d|" if falls == "charged" else "steps after a fall are left out"
@@ -106,16 +117,18 @@ def tracking_table(
         results: by method, one result per training seed.
         subset: one of ``metrics.SUBSETS``; the floors are of all steps and are left out for others.
         falls: what counts after a fall.
-        paper: the paper's errors by method and robot.
+        paper: the paper's errors by method and robot; not shown for robots a method was not trained on, nor
+            for standing, which the paper does not judge by itself.
     """
     ev = _common_protocol(result for runs in results.values() for result in runs)
+    paper = {} if ev.protocol == "standing" else paper
     robots = list(dict.fromkeys(robot for runs in results.values() for result in runs for robot in result.robots))
     rows = []
     for robot in robots:
         if subset == "all":
             rows += [
                 Row(robot=robot, method=name, cells=tuple(Cell(mean=e) for e in errors))
-                for name, errors in FLOORS.items()
+                for name, errors in floors(ev).items()
             ]
         for method, runs in results.items():
             judged = [run for run in runs if robot in run.robots]
@@ -133,10 +146,12 @@ def _row(
 ) -> Row:
     """One method on one robot, over its seeds."""
     errors = [getattr(run.robots[robot].subsets[subset], falls) for run in runs]
-    printed = paper or (None,) * len(COMMANDS)
+    unseen = any(robot in run.unseen for run in runs)
+    printed = (None,) * len(COMMANDS) if paper is None or unseen else paper
     return Row(
         robot=robot,
         method=method,
+        unseen=unseen,
         cells=tuple(_over_seeds([e[d] for e in errors], printed[d]) for d in range(len(COMMANDS))),
         survival=_over_seeds([run.robots[robot].survival for run in runs]),
         seeds=tuple(run.seed for run in runs),

@@ -1,4 +1,4 @@
-"""Survival and errors while one thing about the world gets worse and everything else stays nominal."""
+"""Survival and errors while one thing about the world, or the body, gets worse and everything else stays nominal."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Sweep:
     apply: Callable[[float], RandomizationCfg]
 
 
-SWEEPS: Mapping[str, Sweep] = {
+DISTURBANCES: Mapping[str, Sweep] = {
     "push": Sweep(
         label="push every 5 s, up to [m/s, rad/s]",
         values=(0.0, 0.3, 0.6, 0.9, 1.2),
@@ -59,21 +59,45 @@ SWEEPS: Mapping[str, Sweep] = {
         values=(0.0, 0.005, 0.01, 0.015, 0.02),
         apply=lambda v: replace(NOMINAL, sensing_latency_s=(v, v)),
     ),
-    "mass": Sweep(
-        label="mass and inertia of every link, factor [-]",
-        values=(0.6, 0.8, 1.0, 1.2, 1.4),
-        apply=lambda v: replace(NOMINAL, link_mass_scale=(v, v)),
-    ),
 }
 """Latency ends at one control step, the longest the environment models."""
 
 
+def _around(spread: float) -> tuple[float, float]:
+    return 1.0 - spread, 1.0 + spread
+
+
+BODIES: Mapping[str, Sweep] = {
+    "size": Sweep(
+        label="all lengths, factor [-]",
+        values=(0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.3),
+        apply=lambda v: replace(NOMINAL, morphology_length_scale=(v, v)),
+    ),
+    "mass": Sweep(
+        label="all masses, factor [-]",
+        values=(0.4, 0.6, 0.8, 1.0, 1.2, 1.4, 1.6),
+        apply=lambda v: replace(NOMINAL, morphology_mass_scale=(v, v)),
+    ),
+    "build": Sweep(
+        label="size and mass of each body, drawn within ± [-]",
+        values=(0.0, 0.1, 0.2, 0.3, 0.4),
+        apply=lambda v: replace(NOMINAL, morphology_length_scale=_around(v), morphology_mass_scale=_around(v)),
+    ),
+    "proportions": Sweep(
+        label="mass of each link by itself, drawn within ± [-]",
+        values=(0.0, 0.2, 0.4, 0.6, 0.8),
+        apply=lambda v: replace(NOMINAL, link_mass_scale=_around(v)),
+    ),
+}
+"""Bodies no robot of the fleet has: each grade leads further away from those trained on."""
+
+
 def sweep(
-    policy: Policy, make_env: MakeEnv, robots: Sequence[str], task: TaskCfg, ev: EvaluationCfg, kind: str
+    policy: Policy, make_env: MakeEnv, robots: Sequence[str], task: TaskCfg, ev: EvaluationCfg, through: Sweep
 ) -> dict[float, dict[str, RobotMetrics]]:
-    """Scores of each robot at each strength of one of SWEEPS, under the same commands throughout."""
+    """Scores of each robot at each strength, under the same commands throughout."""
     ev = replace(ev, randomization=True)
     return {
-        value: evaluate(policy, make_env, robots, replace(task, randomization=SWEEPS[kind].apply(value)), ev)
-        for value in SWEEPS[kind].values
+        value: evaluate(policy, make_env, robots, replace(task, randomization=through.apply(value)), ev)
+        for value in through.values
     }

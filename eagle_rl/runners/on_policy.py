@@ -148,11 +148,13 @@ class EagleRunner(OnPolicyRunner):
 
     def _iterate(self) -> dict[str, float]:
         """Collect one rollout and learn from it; return the iteration's scalars by tag."""
-        start = time.perf_counter()
+        start, cpu_start = time.perf_counter(), time.process_time()
+        self.alg.stopwatch.reset()
         with torch.no_grad():  # not inference_mode: the environment keeps its tensors and may change them in place
             for _ in range(self.cfg["num_steps_per_env"]):
                 self._step()
             self.alg.compute_returns(self._obs)
+            self.alg.stopwatch.lap("storage")
         collected = time.perf_counter()
         losses = self.alg.update()
         learned = time.perf_counter()
@@ -168,10 +170,13 @@ class EagleRunner(OnPolicyRunner):
             "Perf/total_fps": steps / (learned - start),
             "Perf/collection_time": collected - start,
             "Perf/learning_time": learned - collected,
+            "Perf/busy_cores": (time.process_time() - cpu_start) / (learned - start),
             "Perf/env_steps": self.env_steps,
             "Perf/wall_time": self.wall_time,
         }
-        return self.logger.collect() | losses | own
+        logged = self.logger.collect()
+        self.alg.stopwatch.lap("logging")
+        return logged | losses | own | {f"Perf/{name}_time": t for name, t in self.alg.stopwatch.seconds.items()}
 
     def _env_steps_per_robot(self) -> dict[str, int]:
         """Environment steps of each robot in an iteration of this process."""
@@ -181,13 +186,20 @@ class EagleRunner(OnPolicyRunner):
 
     def _step(self) -> None:
         """One control step of every environment."""
+        stopwatch = self.alg.stopwatch
         actions = self.alg.act(self._obs)
+        stopwatch.lap("inference")
         obs, rewards, dones, extras = self.env.step(actions.to(self.env.device))
+        stopwatch.lap("MDP")
+        stopwatch.move(extras.get("physics_time", 0.0), "MDP", "physics")
         self._obs, rewards, dones = obs.to(self.device), rewards.to(self.device), dones.to(self.device)
         tensors = {name: x for name, x in self._obs.items() if x.is_floating_point()} | {"rewards": rewards}
         require_sound(tensors, self.robot, self.env.robot_names)
+        stopwatch.lap("logging")
         self.alg.process_env_step(self._obs, rewards, dones, extras)
+        stopwatch.lap("storage")
         self.logger.add_step(rewards, dones, extras)
+        stopwatch.lap("logging")
 
     def imitate(self, specialists: Sequence[EagleActor], method: Literal["eagle", "kickstart"]) -> None:
         """Learn from one specialist per robot, in the order of the environment's robots, too."""
@@ -257,10 +269,13 @@ class EagleRunner(OnPolicyRunner):
         self.provenance = dataclasses.replace(self.provenance, drifted=drifted)
 
     def load_weights(self, path: Path | str) -> None:
-        """Start from the policy and critic of a checkpoint; optimiser, counters and environment stay fresh."""
+        """Start from the learner of a checkpoint: policy, critic, optimiser and learning rate; the rest stays fresh.
+
+        A fresh optimiser at the first learning rate would undo a trained policy in its first update.
+        """
         checkpoint = ckpt.load_checkpoint(Path(path), self.provenance.slot_table_hash)
         self._require_same_shapes(checkpoint)
-        self.alg.load(checkpoint.state["algorithm"], {"actor": True, "critic": True})
+        self.alg.load(checkpoint.state["algorithm"], {"actor": True, "critic": True, "optimizer": True})
 
     def _state(self) -> dict[str, Any]:
         """Everything a checkpoint holds; the part of each process is gathered in the first."""

@@ -17,11 +17,11 @@ from rich.console import Console
 
 from eagle_rl.config.schema import ExperimentCfg
 from eagle_rl.errors import ConfigError, EagleError
+from eagle_rl.evaluation.evaluate import MakeEnv
 from eagle_rl.runners.plan import plan_stages
 from eagle_rl.runners.provenance import Provenance
 from eagle_rl.runners.records import Record, active_stages, final_checkpoint, open_plan, read_record
 from eagle_rl.runners.team import Team
-from eagle_rl.runners.training import MakeEnv
 from eagle_rl.runners.worker import Worker
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from rich.console import Console
 
 from eagle_rl.config.schema import ExperimentCfg
-from eagle_rl.evaluation.evaluate import EvaluationResult, evaluate
+from eagle_rl.evaluation.evaluate import EvaluationResult, MakeEnv, evaluate
 from eagle_rl.evaluation.report import pooled_score
 from eagle_rl.machine import own_cores
 from eagle_rl.models.precision import set_up_torch
@@ -23,7 +23,7 @@ from eagle_rl.runners.plan import Stage
 from eagle_rl.runners.provenance import Provenance
 from eagle_rl.runners.records import Record, active_stages, final_checkpoint, read_record, stage_dir, write_record
 from eagle_rl.runners.team import Team
-from eagle_rl.runners.training import Job, MakeEnv, load_policy, stage_cfg, train
+from eagle_rl.runners.training import Job, load_policy, stage_cfg, train
 
 POLL_S = 1.0
 """Wait of a worker for whom there is nothing to do yet [s]."""

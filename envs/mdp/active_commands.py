@@ -28,6 +28,8 @@ class ActiveCommands:
         robot_id = sampler.robot_id
         self.count = torch.zeros_like(robot_id)
         """How often each environment drew, shape (N,)."""
+        self.age = torch.zeros_like(robot_id)
+        """Control steps for which each command has been in force, shape (N,)."""
         self.command = torch.zeros(len(robot_id), 5, dtype=dtype, device=robot_id.device)
         """(v_x, v_y, omega, h, p), shape (N, 5)."""
         self._pinned: Tensor | None = None
@@ -45,19 +47,29 @@ class ActiveCommands:
 
     def draw(self, ids: Tensor) -> None:
         """Put the next commands of some environments in force, shape (n,)."""
+        self.age[ids] = 0
         if self._pinned is None:
             command, _ = self.sampler.sample(ids, self.count[ids])
             self.count[ids] += 1
             self.command = self.command.index_copy(0, ids, command.to(self.command))
 
+    def renew(self, ids: Tensor, fallen: Tensor) -> None:
+        """Draw for new episodes, shape (n,); one that follows a fall, bool (n,), may have to finish the old command."""
+        if self.sampler.cfg.redraw_after_fall:
+            self.draw(ids)
+        else:
+            self.sampler.spoil(ids[fallen])
+            self.draw(ids[~fallen])
+
     def judge(self, scores: tuple[Tensor, Tensor, Tensor, Tensor]) -> None:
         """Credit one step to the windows of the sampled commands, see ``rewards.success_scores``."""
+        self.age += 1
         if self._pinned is None:
             self.sampler.accumulate(*scores)
 
-    def due(self, episode_length: Tensor) -> Tensor:
+    def due(self) -> Tensor:
         """Environments whose command has been in force for its time, shape (n,)."""
-        return ((episode_length % self._interval == 0) & (episode_length > 0)).nonzero().squeeze(1)
+        return (self.age >= self._interval).nonzero().squeeze(1)
 
     def show(self, state: PooledState, phase: Tensor, gait: GaitCfg) -> None:
         """Let a state, and so the next observation, show the commands now in force."""
@@ -70,10 +82,16 @@ class ActiveCommands:
 
     def state_dict(self) -> dict[str, Tensor]:
         """Commands in force and the curriculum; not what is pinned."""
-        return {"command": self.command.clone(), "count": self.count.clone(), **self.sampler.state_dict()}
+        return {
+            "command": self.command.clone(),
+            "count": self.count.clone(),
+            "age": self.age.clone(),
+            **self.sampler.state_dict(),
+        }
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Restore what :meth:`state_dict` returned."""
         self.command = state["command"].to(self.command)
         self.count = state["count"].to(self.count, copy=True)
+        self.age = state["age"].to(self.age, copy=True)
         self.sampler.load_state_dict(state)

@@ -122,6 +122,10 @@ class CommandSampler:
         self._sums[ids] = 0.0
         return command.to(torch.float32), (command[:, :3] == 0.0).all(dim=1)
 
+    def spoil(self, ids: Tensor) -> None:
+        """Deny success to the open windows of some environments, shape (n,): they fell in them."""
+        self._creditable[ids] = False
+
     def _draw(self, robot: Tensor, draws: Tensor) -> tuple[Tensor, Tensor]:
         """Uniform numbers (n, 7) to raw commands (n, 5) and grid bins (n,).
 

@@ -32,6 +32,13 @@ LINK_DIM = 10
 """Numbers per link: mass [kg]; centre of mass x, y, z [m] and inertia about it xx, yy, zz, xy, xz, yz [kg m^2], in the
 link's frame."""
 
+LINK_CHANNELS = (
+    ("mass", "kg"),
+    *((f"CoM {axis}", "m") for axis in "xyz"),
+    *((f"inertia {axes}", "kg m²") for axes in ("xx", "yy", "zz", "xy", "xz", "yz")),
+)
+"""Name and unit of each of those numbers."""
+
 REFERENCE_ROBOTS = ("h1", "g1", "t1", "n1", "adam")
 """The robots whose spread standardises the channels, so that a checkpoint means the same with any set of robots."""
 

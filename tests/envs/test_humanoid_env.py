@@ -220,6 +220,21 @@ def test_commands_are_redrawn_at_the_interval() -> None:
     assert redrawn == [5, 10]
 
 
+@pytest.mark.parametrize("redraw", [True, False])
+def test_after_a_fall_the_old_command_ends_or_lasts_as_configured(redraw: bool) -> None:
+    commands = CommandsCfg(resampling_time_s=0.1, redraw_after_fall=redraw)
+    env = make_env(task=replace(TaskCfg(), commands=commands))
+    for _ in rollout(env, 3, scale=0.0):
+        pass
+    before = env.command
+    env._reset(torch.tensor([0, 1]), torch.tensor([True, False]))
+    kept = (env.command == before).all(dim=1).tolist()
+    assert kept == [not redraw, False, True, True], "environment 0 fell, 1 timed out, 2 and 3 went on"
+    for _ in rollout(env, 2, scale=0.0):
+        pass
+    assert not torch.equal(env.command[0], before[0]), "a command never lasts longer than its time"
+
+
 def test_the_curriculum_goes_by_what_all_processes_saw() -> None:
     """Another process falls all the time and never steps, but has opened every command."""
     alone, together = make_env(), make_env()

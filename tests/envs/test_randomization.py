@@ -129,7 +129,7 @@ def pushed_steps(task: TaskCfg) -> list[int]:
 def test_new_gains_are_drawn_for_every_episode_but_bodies_stay() -> None:
     env = make_env(["h1"], 4)
     before = {name: values.copy() for name, values in readings(env).items()}
-    env._reset(torch.tensor([1, 2]))
+    env._reset(torch.tensor([1, 2]), torch.tensor([False, False]))
     after = readings(env)
     for name in ("friction", "stiffness", "damping", "motor_offset", "latency"):
         same = (before[name] == after[name]).reshape(4, -1).all(axis=1)

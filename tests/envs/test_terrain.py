@@ -164,7 +164,7 @@ def test_robots_start_on_a_patch_of_their_level_and_above_the_ground(kind: str) 
     assert set(env.ground.level.tolist()) == {0, 1, 2}, "levels 0 to 3, as far as there are"
     for level in (0, 2):
         env.ground.level = torch.full_like(env.ground.level, level)
-        env._reset(env._all)
+        env.reset()
         middle = env.ground._centres[level, 0, 0]
         assert (env.state.root_pos_w[:, 0] - middle).abs().max() <= 1.0 + 1e-5
         assert len((env.state.root_pos_w[:, 1] / 5.0).round().unique()) > 3, "variants"

@@ -41,7 +41,7 @@ class ScriptedEnv:
         return (self.measured - self.command).abs()
 
 
-def make_scripted_env(robots: Sequence[str], num_envs: int, task: TaskCfg, seed: int) -> ScriptedEnv:
+def make_scripted_env(robots: Sequence[str], num_envs: int, task: TaskCfg, seed: int, first: int = 0) -> ScriptedEnv:
     """The ``make_env`` of an evaluation."""
     return ScriptedEnv(num_envs, task)
 

@@ -52,7 +52,7 @@ def test_a_policy_of_one_robot_is_the_papers_single_robot_ppo_unless_told_otherw
 def test_a_policy_can_be_judged_on_robots_it_has_never_seen(run, capsys):
     assert main([f"PPO={run.run_dir}", *QUICK, "--robots", "g1"]) == 0
     out = capsys.readouterr().out
-    assert "| g1 | PPO |" in out
+    assert "| g1 | PPO (unseen) |" in out
     assert "| h1 |" not in out
 
 

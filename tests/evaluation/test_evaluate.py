@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import pytest
 import torch
@@ -13,6 +13,7 @@ from torch import Tensor
 from eagle_rl.config.schema import EvaluationCfg, TaskCfg
 from eagle_rl.evaluation.evaluate import EvaluationResult, evaluate
 from eagle_rl.evaluation.metrics import RobotMetrics
+from eagle_rl.evaluation.reference import floors
 from tests.evaluation.fake import ScriptedEnv, idle, make_scripted_env, perfect
 
 FLOORS = (0.50, 0.20, 0.50, 0.15, 0.2125)
@@ -25,28 +26,50 @@ def run(policy, make_env=make_scripted_env, ev=EV, **kwargs) -> RobotMetrics:
     return evaluate(policy, make_env, ["h1"], TaskCfg(), ev, **kwargs)["h1"]
 
 
-@pytest.mark.parametrize("protocol", ["single", "joint"])
+@pytest.mark.parametrize("protocol", ["single", "joint", "standing"])
 def test_a_perfect_tracker_scores_zero(protocol):
     metrics = run(perfect, ev=dataclasses.replace(EV, protocol=protocol))
     assert metrics.survival == 1.0
     assert metrics.subsets["all"].errors == pytest.approx((0,) * 5, abs=1e-7)
 
 
-@pytest.mark.parametrize("protocol", ["single", "joint"])
-@pytest.mark.parametrize("resampling_time_s", [0.0, 0.02])
-def test_an_idle_robot_scores_the_closed_form_floors(protocol, resampling_time_s):
+def constantly(*measured: float) -> Callable[[TensorDict], Tensor]:
+    """A policy that measures the same whatever is commanded."""
+    return lambda obs: torch.nn.functional.pad(torch.tensor(measured).expand(len(obs), 5), (0, 27))
+
+
+@pytest.mark.parametrize(
+    ("protocol", "resampling_time_s", "velocities"),
+    [
+        ("single", 0.0, (0.50, 0.20, 0.50)),
+        ("joint", 0.0, (0.50, 0.20, 0.50)),
+        ("joint", 0.02, (0.50, 0.20, 0.50)),
+        ("standing", 0.0, (0.0, 0.0, 0.0)),
+        ("standing", 0.02, (0.25, 0.10, 0.25)),
+    ],
+)
+def test_an_idle_robot_scores_the_closed_form_floors(protocol, resampling_time_s, velocities):
     ev = dataclasses.replace(EV, protocol=protocol, resampling_time_s=resampling_time_s)
-    assert run(idle, ev=ev).subsets["all"].errors == pytest.approx(FLOORS, rel=0.05)
+    floor = (*velocities, 0.15, 0.2125)
+    assert floors(ev)["stand still"] == pytest.approx(floor)
+    assert run(idle, ev=ev).subsets["all"].errors == pytest.approx(floor, rel=0.05)
 
 
-def test_the_best_constant_scores_its_closed_form():
-    middle = torch.tensor([0.3, 0.0, 0.0, -0.15, 0.1])
-    metrics = run(lambda obs: torch.nn.functional.pad(middle.expand(len(obs), 5), (0, 27)))
-    assert metrics.subsets["all"].errors == pytest.approx((0.45, 0.20, 0.50, 0.075, 0.20), rel=0.05)
+@pytest.mark.parametrize(("protocol", "forward"), [("joint", 0.3), ("standing", 0.0)])
+def test_the_best_constant_scores_its_closed_form(protocol, forward):
+    ev = dataclasses.replace(EV, protocol=protocol)
+    metrics = run(constantly(forward, 0.0, 0.0, -0.15, 0.1), ev=ev)
+    assert metrics.subsets["all"].errors == pytest.approx(floors(ev)["best constant"], rel=0.05)
+
+
+def test_a_robot_that_drifts_while_it_should_stand_is_charged_its_speed():
+    ev = dataclasses.replace(EV, protocol="standing")
+    errors = run(constantly(0.1, -0.2, 0.3, 0.0, 0.0), ev=ev).subsets["standing"].errors
+    assert errors[:3] == pytest.approx((0.1, 0.2, 0.3))
 
 
 def test_after_a_fall_own_errors_stop_and_charged_errors_are_those_of_standing_still():
-    def falls_in_third_step(robots: Sequence[str], num_envs: int, task: TaskCfg, seed: int) -> ScriptedEnv:
+    def falls_in_third_step(robots: Sequence[str], num_envs: int, task: TaskCfg, seed: int, first: int) -> ScriptedEnv:
         return ScriptedEnv(num_envs, task, fall_at=3)
 
     metrics = run(perfect, falls_in_third_step)
@@ -57,7 +80,7 @@ def test_after_a_fall_own_errors_stop_and_charged_errors_are_those_of_standing_s
 
 
 def test_a_fall_in_the_first_step_leaves_no_own_errors_but_the_whole_charge():
-    metrics = run(idle, lambda robots, n, task, seed: ScriptedEnv(n, task, fall_at=1))
+    metrics = run(idle, lambda robots, n, task, seed, first: ScriptedEnv(n, task, fall_at=1))
     assert metrics.subsets["all"].errors == (None,) * 5
     assert metrics.subsets["all"].charged == pytest.approx(FLOORS, rel=0.05)
 
@@ -90,7 +113,7 @@ def test_settled_steps_begin_one_second_after_each_new_command():
 def test_the_task_of_an_evaluation_has_no_aids_noise_or_time_out():
     seen = []
 
-    def spy(robots: Sequence[str], num_envs: int, task: TaskCfg, seed: int) -> ScriptedEnv:
+    def spy(robots: Sequence[str], num_envs: int, task: TaskCfg, seed: int, first: int) -> ScriptedEnv:
         seen.append(task)
         return ScriptedEnv(num_envs, task)
 
@@ -106,5 +129,5 @@ def test_the_task_of_an_evaluation_has_no_aids_noise_or_time_out():
 
 def test_a_result_survives_its_json():
     metrics = evaluate(perfect, make_scripted_env, ["h1", "g1"], TaskCfg(), EV)
-    result = EvaluationResult(checkpoint="0" * 64, protocol=EV, robots=metrics, seed=3)
+    result = EvaluationResult(checkpoint="0" * 64, protocol=EV, robots=metrics, seed=3, unseen=("g1",))
     assert EvaluationResult.from_json(result.to_json()) == result

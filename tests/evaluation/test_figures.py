@@ -17,7 +17,7 @@ from eagle_rl.evaluation.curves import RoundScores, curves_to_csv, read_curves, 
 from eagle_rl.evaluation.evaluate import EvaluationResult, evaluate
 from eagle_rl.evaluation.latents import Embeddings
 from eagle_rl.evaluation.response import command_responses, script
-from eagle_rl.evaluation.robustness import NOMINAL, SWEEPS, sweep
+from eagle_rl.evaluation.robustness import BODIES, DISTURBANCES, NOMINAL, sweep
 from tests.evaluation.fake import ScriptedEnv, idle, make_scripted_env, perfect
 
 
@@ -95,7 +95,7 @@ class MeasuringEnv(ScriptedEnv):
 
 
 def test_a_perfect_tracker_answers_with_the_command_until_it_falls():
-    def falls(robots: Sequence[str], num_envs: int, task: TaskCfg, seed: int) -> MeasuringEnv:
+    def falls(robots: Sequence[str], num_envs: int, task: TaskCfg, seed: int, first: int = 0) -> MeasuringEnv:
         return MeasuringEnv(num_envs, task, fall_at=500)
 
     response = command_responses(perfect, falls, ["a"], TaskCfg(), EvaluationCfg())[0]
@@ -103,20 +103,20 @@ def test_a_perfect_tracker_answers_with_the_command_until_it_falls():
     assert np.isnan(response.measured[499:]).all()
 
 
-@pytest.mark.parametrize("kind", SWEEPS)
-def test_a_sweep_changes_one_thing_and_passes_through_the_nominal_world(kind):
-    nominal = [v for v in SWEEPS[kind].values if SWEEPS[kind].apply(v) == NOMINAL]
-    assert len(nominal) == 1, f"{kind} must contain the nominal world once"
+@pytest.mark.parametrize("through", [*DISTURBANCES.values(), *BODIES.values()], ids=lambda sweep: sweep.label)
+def test_a_sweep_changes_one_thing_and_passes_through_the_nominal_world(through):
+    nominal = [v for v in through.values if through.apply(v) == NOMINAL]
+    assert len(nominal) == 1, f"{through.label} must contain the nominal world once"
     seen = []
 
-    def spy(robots: Sequence[str], num_envs: int, task: TaskCfg, seed: int) -> ScriptedEnv:
+    def spy(robots: Sequence[str], num_envs: int, task: TaskCfg, seed: int, first: int = 0) -> ScriptedEnv:
         seen.append(task.randomization)
         return ScriptedEnv(num_envs, task)
 
     ev = EvaluationCfg(num_envs_per_robot=2, num_steps=1)
-    scores = sweep(perfect, spy, ["a"], TaskCfg(), ev, kind)
-    assert seen == [SWEEPS[kind].apply(v) for v in SWEEPS[kind].values]
-    assert [scores[v]["a"].survival for v in SWEEPS[kind].values] == [1.0] * len(seen)
+    scores = sweep(perfect, spy, ["a"], TaskCfg(), ev, through)
+    assert seen == [through.apply(v) for v in through.values]
+    assert [scores[v]["a"].survival for v in through.values] == [1.0] * len(seen)
 
 
 def test_curves_are_read_per_robot_and_smoothed(tmp_path):
@@ -162,11 +162,11 @@ def test_figures_are_written_as_png_and_pdf(tmp_path):
     embeddings = clusters(5.0)
     score = RoundScores(robot="h1", specialist=False, position=0.0, errors=(0.1,) * 5)
     ev = EvaluationCfg(num_envs_per_robot=2, num_steps=1)
-    swept = sweep(perfect, make_scripted_env, ["h1"], TaskCfg(), ev, "push")
+    swept = sweep(perfect, make_scripted_env, ["h1"], TaskCfg(), ev, DISTURBANCES["push"])
     figures = {
         "latents": plots.latent_maps({"PPO": (embeddings, np.zeros((240, 2), dtype=np.float32), 0.5, 0.9)}),
         "rounds": plots.error_rounds([score]),
-        "robustness": plots.robustness([(SWEEPS["push"], swept)]),
+        "robustness": plots.robustness([(DISTURBANCES["push"], swept)]),
     }
     assert "silhouette 0.50, linear probe 90.0%" in figures["latents"].axes[0].get_title()
     for name, figure in figures.items():

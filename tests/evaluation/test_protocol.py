@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from eagle_rl.config.schema import CommandsCfg, EvaluationCfg, TaskCfg, TerrainCfg
-from eagle_rl.evaluation.protocol import COMMANDS, draw_commands, evaluation_task, varied_commands
+from eagle_rl.evaluation.protocol import COMMANDS, draw_commands, drawn_commands, evaluation_task, judged_commands
 
 CFG = CommandsCfg()
 EV = EvaluationCfg(num_steps=400, resampling_time_s=4.0)
@@ -20,7 +20,7 @@ def test_more_environments_move_nobody_elses_commands(few, more):
     assert torch.equal(draw_commands(CFG, EV, "h1", few), draw_commands(CFG, EV, "h1", few + more)[:few])
 
 
-@given(seed=st.integers(0, 2**31), protocol=st.sampled_from(["single", "joint"]))
+@given(seed=st.integers(0, 2**31), protocol=st.sampled_from(["single", "joint", "standing"]))
 def test_commands_stay_in_the_finishing_ranges_and_others_are_zero(seed, protocol):
     ev = dataclasses.replace(EV, seed=seed, protocol=protocol)
     commands = draw_commands(CFG, ev, "g1", 40)
@@ -28,13 +28,31 @@ def test_commands_stay_in_the_finishing_ranges_and_others_are_zero(seed, protoco
     for d, name in enumerate(COMMANDS):
         low, high = getattr(CFG, name).finishing
         assert ((commands[..., d] >= low) & (commands[..., d] <= high)).all()
-    assert (commands[~varied_commands(ev, 40).unsqueeze(1).expand_as(commands)] == 0).all()
+    assert ((commands == 0) == ~drawn_commands(ev, 40)).all()
 
 
 def test_single_splits_the_environments_evenly_over_the_commands():
-    varied = varied_commands(EvaluationCfg(protocol="single"), 100)
-    assert (varied.sum(0) == 20).all()
-    assert (varied.sum(1) == 1).all()
+    ev = EvaluationCfg(protocol="single")
+    judged = judged_commands(ev, 100)
+    assert (judged.sum(0) == 20).all()
+    assert (judged.sum(1) == 1).all()
+    assert torch.equal(drawn_commands(ev, 100), judged.unsqueeze(1))
+
+
+def test_standing_holds_every_velocity_at_exactly_zero_and_judges_all_five():
+    ev = EvaluationCfg(protocol="standing")
+    commands = draw_commands(CFG, ev, "h1", 50)
+    assert (commands[..., :3] == 0).all()
+    assert (commands[..., 3:] != 0).all()
+    assert judged_commands(ev, 50).all()
+
+
+def test_redrawn_standing_alternates_with_walking_and_half_of_the_robots_stand_at_any_time():
+    commands = draw_commands(CFG, dataclasses.replace(EV, protocol="standing", num_steps=1000), "h1", 50)
+    standing = (commands[..., :3] == 0).all(-1)
+    assert standing.shape == (50, 5)
+    assert (standing[:, 1:] != standing[:, :-1]).all()
+    assert (standing.sum(0) == 25).all()
 
 
 def test_robots_and_seeds_draw_different_commands():

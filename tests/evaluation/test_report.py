@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import io
 import json
 
@@ -20,7 +21,9 @@ from tests.evaluation.fake import idle, make_scripted_env, perfect
 EV = EvaluationCfg(num_envs_per_robot=16, num_steps=2)
 
 
-def result(errors: tuple[float | None, ...], seed: int = 1, ev: EvaluationCfg = EV, robots=("h1",)) -> EvaluationResult:
+def result(
+    errors: tuple[float | None, ...], seed: int = 1, ev: EvaluationCfg = EV, robots=("h1",), unseen=()
+) -> EvaluationResult:
     subset = TrackingErrors(share=1.0, errors=errors, charged=tuple(e and 2 * e for e in errors))
     metrics = RobotMetrics(num_envs=16, survival=0.5, upright=0.75, subsets=dict.fromkeys(SUBSETS, subset))
     return EvaluationResult(
@@ -29,6 +32,7 @@ def result(errors: tuple[float | None, ...], seed: int = 1, ev: EvaluationCfg = 
         robots=dict.fromkeys(robots, metrics),
         seed=seed,
         env_steps=2_000_000 * seed,
+        unseen=unseen,
     )
 
 
@@ -48,6 +52,26 @@ def test_the_papers_number_stands_beside_ours_only_for_its_methods_and_robots():
     assert papers[("h1", "EAGLE")] == PAPER["EAGLE"]["h1"][0]
     assert papers[("mine", "EAGLE")] is None
     assert papers[("h1", "mine")] is None
+
+
+def test_a_robot_a_method_was_not_trained_on_is_labelled_and_the_papers_number_left_out():
+    table = tracking_table({"PPO": [result((0.1,) * 5, robots=("h1", "g1"), unseen=("h1",))]})
+    labels = {row.robot: (row.unseen, row.cells[0].paper) for row in table.rows if row.method == "PPO"}
+    assert labels == {"h1": (True, None), "g1": (False, PAPER["PPO"]["g1"][0])}
+    for text in (to_markdown(table), to_latex(table)):
+        assert text.count("PPO (unseen)") == 1
+    assert [row["unseen"] for row in csv.DictReader(io.StringIO(to_csv(table))) if row["method"] == "PPO"] == [
+        "True",
+        "False",
+    ]
+
+
+def test_standing_has_floors_of_its_own_and_no_numbers_of_the_paper():
+    ev = dataclasses.replace(EV, protocol="standing")
+    table = tracking_table({"PPO": [result((0.1,) * 5, ev=ev)]})
+    assert table.rows[0].cells[0].mean == 0.0
+    assert table.rows[-1].cells[0].paper is None
+    assert "exactly zero" in table.caption
 
 
 def test_charged_errors_are_shown_unless_asked_otherwise():

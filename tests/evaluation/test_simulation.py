@@ -41,5 +41,20 @@ def test_the_score_does_not_depend_on_the_number_of_physics_threads():
     assert all(e is not None and math.isfinite(e) for e in scores[0].subsets["all"].charged)
 
 
+def test_randomized_and_noisy_scores_do_not_depend_on_the_chunk_size():
+    ev = EvaluationCfg(num_envs_per_robot=130, num_steps=12, randomization=True, noise=True)
+    whole, parts = (evaluate(idle, MAKE_ENV, ["h1"], TaskCfg(), ev, chunk_envs=chunk)["h1"] for chunk in (256, 128))
+    assert whole == parts
+
+
+def test_a_pool_in_parts_draws_what_the_whole_draws():
+    task = TaskCfg()
+    whole = MAKE_ENV(["h1"], 5, task, 3).get_observations()
+    parts = [MAKE_ENV(["h1"], 2, task, 3), MAKE_ENV(["h1"], 3, task, 3, 2)]
+    for name, values in whole.items():
+        joined = torch.cat([part.get_observations()[name] for part in parts])
+        torch.testing.assert_close(joined, values, rtol=0, atol=0, msg=f"group {name}")
+
+
 def test_environment_factories_can_be_sent_to_other_processes():
     assert pickle.loads(pickle.dumps(MAKE_ENV))(["h1"], 1, TaskCfg(), 0).num_envs == 1

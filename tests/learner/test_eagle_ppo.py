@@ -92,7 +92,13 @@ def hand_written_loss(runner: EagleRunner, bank: list[EagleActor]) -> torch.Tens
 
 def test_the_gradient_of_update_is_that_of_a_hand_written_sum_of_all_losses():
     runner = make_runner(
-        **ONE_STEP, mirror_fraction=1.0, max_grad_norm=1e9, learning_rate=0.0, entropy_coef=0.01, action_loss_coef=0.3
+        **ONE_STEP,
+        mirror_fraction=1.0,
+        max_grad_norm=1e9,
+        learning_rate=0.0,
+        entropy_coef=0.01,
+        action_loss_coef=0.3,
+        desired_kl=1e3,
     )
     runner.env.mask[::3, 2] = 0.0  # a robot that is not its own mirror image
     bank = with_specialists(runner)
@@ -157,6 +163,14 @@ def test_the_learning_rate_follows_the_kl_of_the_last_epoch():
     assert runner.alg.update()["Loss/kl"] > 0.0, "the KL of the first epoch, before any step, is zero"
 
 
+def test_the_critic_s_learning_rate_is_its_own():
+    runner = make_runner(critic_learning_rate=3e-4, desired_kl=1e-6)
+    collect(runner)
+    runner.alg.update()
+    assert runner.alg.learning_rate < runner.alg.cfg.learning_rate, "the actor's follows the KL"
+    assert [group["lr"] for group in runner.alg.optimizer.param_groups] == [runner.alg.learning_rate, 3e-4]
+
+
 @pytest.mark.parametrize(("kl", "factor"), [(0.0, 1), (0.004, 1.5), (0.006, 1), (0.019, 1), (0.021, 1 / 1.5)])
 def test_the_learning_rate_is_kept_while_the_kl_is_within_a_factor_of_two_of_its_target(kl, factor):
     alg = make_runner(desired_kl=0.01).alg
@@ -175,11 +189,29 @@ def test_the_mirror_loss_is_computed_on_its_share_of_a_minibatch(monkeypatch):
 
 
 def test_the_learned_std_stays_inside_its_range():
-    runner = make_runner(entropy_coef=10.0, learning_rate=0.1, learning_rate_range=(0.1, 0.1))
+    runner = make_runner(entropy_coef=10.0, learning_rate=1.0, learning_rate_range=(1.0, 1.0))
     collect(runner)
     runner.alg.update()
     std = runner.alg.actor.distribution.std_param
     assert std.max() == runner.alg.actor.distribution.std_range[1]
+
+
+def test_a_policy_that_has_moved_too_far_takes_no_further_step():
+    """One step of a huge learning rate is taken; the remaining three of the update would be too."""
+    ends = []
+    for epochs in (1, 4):
+        runner = make_runner(num_learning_epochs=epochs, num_mini_batches=1, learning_rate=0.3)
+        collect(runner)
+        assert runner.alg.update()["Loss/withheld_steps"] == epochs - 1
+        ends.append(parameters(runner))
+    for key, x in ends[0].items():
+        torch.testing.assert_close(ends[1][key], x, msg=key)
+
+
+def test_imitation_alone_may_move_as_far_as_it_likes():
+    runner = make_runner(num_learning_epochs=4, num_mini_batches=1, learning_rate=0.3, use_ppo_loss=False)
+    collect(runner)
+    assert runner.alg.update()["Loss/withheld_steps"] == 0.0
 
 
 @pytest.mark.parametrize("poison", [math.nan, math.inf, -math.inf, 1e30])

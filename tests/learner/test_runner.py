@@ -1,5 +1,6 @@
 """Training runs learn, and resume bit for bit."""
 
+import itertools
 import json
 import os
 import socket
@@ -11,10 +12,11 @@ import pytest
 import torch
 from rich.console import Console
 
+from eagle_rl.algorithms.stopwatch import SECTIONS
 from eagle_rl.errors import CheckpointError
 from eagle_rl.runners import checkpoint as ckpt
 from eagle_rl.runners.on_policy import EagleRunner
-from eagle_rl.runners.progress import ProgressReport
+from eagle_rl.runners.progress import BUDGET_INTERVAL, ProgressReport
 from eagle_rl.runners.provenance import Provenance
 from tests.learner.helpers import make_runner, parameters
 from tests.learner.test_eagle_ppo import shaken
@@ -52,9 +54,10 @@ def compare(a, b, where: str) -> None:
         assert a == b, where
 
 
-def test_training_raises_the_reward_of_every_robot(tmp_path):
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+def test_training_raises_the_reward_of_every_robot(tmp_path, precision):
     algo = {"gamma": 0.8, "num_steps_per_env": 16, "desired_kl": 0.02, "learning_rate_range": (1e-4, 1e-2)}
-    make_runner(tmp_path, ToyEnv(48), **algo).learn(30)
+    make_runner(tmp_path, ToyEnv(48), precision=precision, **algo).learn(30)
     rows = metrics(tmp_path)
     first, last = rows[4], rows[-1]  # by the fifth iteration the shortened first episodes are few
     for robot, share in {"/one": 0.7, "/two": 0.7, "/three": 0.9, "": 0.7}.items():
@@ -98,13 +101,14 @@ def test_logged_rewards_and_lengths_are_those_of_finished_episodes():
     assert tags["Train/mean_reward/one"] == pytest.approx(sum(rewards) / len(rewards))
 
 
-def test_a_resumed_run_equals_the_uninterrupted_one_bit_for_bit(tmp_path):
-    whole = make_runner(tmp_path / "whole")
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+def test_a_resumed_run_equals_the_uninterrupted_one_bit_for_bit(tmp_path, precision):
+    whole = make_runner(tmp_path / "whole", precision=precision)
     whole.learn(5)
-    cut = make_runner(tmp_path / "cut")
+    cut = make_runner(tmp_path / "cut", precision=precision)
     path = cut.learn(3)  # 24 steps: in the middle of episodes of 16
     torch.manual_seed(12345)
-    resumed = make_runner(tmp_path / "cut")
+    resumed = make_runner(tmp_path / "cut", precision=precision)
     resumed.load(path)
     resumed.learn(2)
     assert_same(whole, resumed)
@@ -212,14 +216,17 @@ def test_a_checkpoint_of_another_number_of_processes_is_refused(tmp_path):
         make_runner().load(path)
 
 
-def test_a_stage_starts_from_the_weights_of_another_with_fresh_counters(tmp_path):
+def test_a_stage_starts_from_the_learner_of_another_with_fresh_counters(tmp_path):
     root = make_runner(tmp_path)
     path = root.learn(2)
     stage = make_runner(env=ToyEnv(8, ("two",)), seed=9)
     stage.load_weights(path)
     compare(parameters(root), parameters(stage), "weights")
     assert stage.current_learning_iteration == stage.env_steps == stage.alg.num_updates == 0
-    assert not stage.alg.optimizer.state
+    assert stage.alg.learning_rate == root.alg.learning_rate != root.alg.cfg.learning_rate
+    moments = [[s["exp_avg"] for s in runner.alg.optimizer.state_dict()["state"].values()] for runner in (root, stage)]
+    assert moments[0], "the optimiser has no state to take over"
+    assert all(torch.equal(*pair) for pair in zip(*moments, strict=True))
 
 
 def test_first_episodes_are_staggered_unless_the_run_is_resumed(tmp_path):
@@ -248,6 +255,30 @@ def test_progress_is_one_line_with_the_time_left(capsys):
         progress.update(2, 15360, scalars)
     out = capsys.readouterr().out
     assert out == "round1/distill 2/2 | 0.02M steps | 3000/s | reward 1.50 | length 900 | 0.0 min left\n"
+
+
+def test_a_run_says_now_and_then_where_its_time_goes(capsys):
+    times = {f"Perf/{name}_time": 1.0 for name in SECTIONS} | {"Perf/physics_time": 3.0}
+    with ProgressReport("ppo", 0, 1000, Console(force_terminal=False, width=200)) as progress:
+        for iteration in range(1, 2 * BUDGET_INTERVAL):
+            progress.update(iteration, 1, times | {"Perf/total_fps": 1.0, "Perf/busy_cores": 1.25})
+    (line,) = capsys.readouterr().out.splitlines()
+    assert line.startswith("ppo time: physics 30%, MDP 10%, ")
+    assert line.endswith(" | 1.2 cores busy")
+
+
+def test_the_parts_of_an_iteration_are_logged_and_add_up_to_it(tmp_path, monkeypatch):
+    clock = itertools.count().__next__
+    monkeypatch.setattr("eagle_rl.algorithms.stopwatch.time.perf_counter", lambda: float(clock()))
+    runner = make_runner(tmp_path)
+    runner.learn(1)
+    begin = clock()
+    scalars = runner._iterate()
+    end = clock()
+    seconds = {name: scalars[f"Perf/{name}_time"] for name in SECTIONS}
+    assert seconds.pop("physics") == 0.0, "the toy robots have none"
+    assert all(s > 0 for s in seconds.values()), seconds
+    assert end - begin - sum(seconds.values()) <= 3, "only what is read from the clock before and after"
 
 
 def test_progress_draws_a_bar_on_a_terminal(capsys):

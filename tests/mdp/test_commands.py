@@ -122,6 +122,16 @@ def test_a_window_cut_short_by_a_fall_fails() -> None:
     assert torch.equal(s.weights, before)
 
 
+def test_a_window_with_a_fall_in_it_fails() -> None:
+    s = sampler()
+    draw(s)
+    before = s.weights.clone()
+    s.spoil(torch.arange(len(s.robot_id)))
+    track(s, lin_vel=1.0, ang_vel=1.0, force=1.0, vel=1.0)
+    draw(s, 1)
+    assert torch.equal(s.weights, before)
+
+
 def test_windows_with_a_zeroed_velocity_do_not_count() -> None:
     s = sampler()
     draw(s)

@@ -45,7 +45,7 @@ class MakeEnv:
     def __init__(self, seed: int | None, steps: int) -> None:
         self.seed, self.steps = seed, steps
 
-    def __call__(self, robots: Sequence[str], num_envs: int, task: TaskCfg, seed: int) -> DeadlyEnv:
+    def __call__(self, robots: Sequence[str], num_envs: int, task: TaskCfg, seed: int, first: int = 0) -> DeadlyEnv:
         return DeadlyEnv(num_envs, tuple(robots), seed, self.steps if seed == self.seed else None)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -60,7 +61,7 @@ def test_a_specialist_starts_from_the_generalists_weights(tmp_path):
     cfg = toy_experiment(iterations=1, judge_envs=0)
     seen = {}
 
-    def watch(robots, num_envs, task, seed):
+    def watch(robots, num_envs, task, seed, first=0):
         seen[tuple(robots)] = task
         return make_toy_env(robots, num_envs, task, seed)
 
@@ -155,6 +156,16 @@ def test_ppo_continued_forks_from_a_root_with_fresh_counters(finished, tmp_path)
     assert result.records["root"].sha256 == finished.records["generalist"].sha256
     assert result.records["root"].env_steps == 0
     assert result.env_steps == 2 * ENVS * STEPS
+
+
+def test_a_root_trained_with_other_actions_is_told(finished, tmp_path, capsys):
+    root = finished.run_dir / finished.records["generalist"].checkpoint
+    cfg = toy_experiment(iterations=1, judge_envs=0, method="ppo", root=str(root))
+    run_experiment(cfg, tmp_path / "same", make_toy_env)
+    assert "warning" not in capsys.readouterr().err
+    control = replace(cfg.task.control, waist_ratio=0.125)
+    run_experiment(replace(cfg, task=replace(cfg.task, control=control)), tmp_path / "other", make_toy_env)
+    assert "task.control.waist_ratio: 0.5 -> 0.125" in capsys.readouterr().err
 
 
 def test_kickstarting_distils_with_its_own_loss(finished, tmp_path):

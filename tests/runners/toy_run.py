@@ -46,7 +46,7 @@ class JudgedToyEnv(ToyEnv):
         return (self.frames[:, 0, :5] - self.command).abs()
 
 
-def make_toy_env(robots: Sequence[str], num_envs: int, task: TaskCfg, seed: int) -> JudgedToyEnv:
+def make_toy_env(robots: Sequence[str], num_envs: int, task: TaskCfg, seed: int, first: int = 0) -> JudgedToyEnv:
     return JudgedToyEnv(num_envs, tuple(robots), seed)
 
 
