@@ -47,7 +47,7 @@ setup(
     scripts=["train.py", "play.py"],
     entry_points={"console_scripts": ["eagle = eagle_rl.cli.main:main"]},
     install_requires=[
-        "torch>=2.6",
+        "torch>=2.13",
         "rsl-rl-lib>=5.5.1,<5.6",
         "tensordict>=0.7",
         "mujoco>=3.17",
@@ -65,7 +65,7 @@ setup(
         "scikit-learn>=1.5.2",
         "safetensors>=0.4",
         "onnx>=1.17",
-        "onnxscript>=0.5.4",
+        "onnxscript>=0.6",
         "onnxruntime>=1.20",
     ],
     extras_require={
