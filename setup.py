@@ -1,4 +1,4 @@
-"""Packaging. ``cfg`` and ``assets`` live at the top of the repository and travel inside the package."""
+"""Packaging. Configuration, robots and the published policy live at the top of the repository and travel inside."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from setuptools import find_packages, setup
 from setuptools.command.build_py import build_py
 
 ROOT = Path(__file__).resolve().parent
-DATA_FOLDERS = ("cfg", "assets")
+DATA_FOLDERS = ("cfg", "assets", "checkpoints")
 
 
 class BuildWithData(build_py):
@@ -23,7 +23,7 @@ class BuildWithData(build_py):
         for name in DATA_FOLDERS:
             target = Path(self.build_lib) / "eagle_rl" / "data" / name
             shutil.rmtree(target, ignore_errors=True)
-            shutil.copytree(ROOT / name, target)
+            shutil.copytree(ROOT / name, target, ignore=shutil.ignore_patterns("root"))  # to train on from: 10 MB
 
 
 def version() -> str:
@@ -74,7 +74,6 @@ setup(
             "setuptools>=70.1",
             "pytest>=8.0",
             "pytest-cov>=5.0",
-            "pytest-xdist>=3.5",
             "hypothesis>=6.100",
             "ruff>=0.12",
             "mypy>=1.13",

@@ -49,6 +49,10 @@ class Interrupted(KeyboardInterrupt):
     exit_code = 130
 
 
+class EagleWarning(UserWarning):
+    """What went wrong without ending the command, which prints it as one line."""
+
+
 def did_you_mean(got: str, known: Iterable[str]) -> str:
     """Return `` Did you mean X?`` for the known name nearest to ``got``, or an empty string."""
     close = difflib.get_close_matches(got, list(known), n=1, cutoff=0.5)

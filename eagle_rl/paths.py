@@ -1,4 +1,4 @@
-"""Where the data files are: ``cfg/`` and ``assets/``, in a checkout and in an installed package alike."""
+"""Where the data files are: ``cfg/``, ``assets/`` and ``checkpoints/``, in a checkout and in an installed package."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ _PACKAGE = Path(__file__).resolve().parent
 
 
 def data_root() -> Path:
-    """Folder that holds ``cfg/`` and ``assets/``.
+    """Folder that holds ``cfg/``, ``assets/`` and ``checkpoints/``.
 
-    A wheel carries both inside the package; a checkout has them beside it, where they are meant to be edited.
+    A wheel carries them inside the package; a checkout has them beside it, where they are meant to be edited.
     """
     packaged = _PACKAGE / "data"
     return packaged if packaged.is_dir() else _PACKAGE.parent

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -103,7 +104,7 @@ class HumanoidEnv(VecEnv):
             RobotBatch(spec, build_model(spec, task.sim, field), count, task.sim.decimation, num_threads)
             for spec, count in zip(robots, counts, strict=True)
         ]
-        self.pool = PhysicsPool(batches, self.device, dtype)
+        self.pool = PhysicsPool(batches, self.device, dtype, overlap=num_threads != 1)
         nominal = pool_robots(robots, counts, task.control, task.rewards, self.device, dtype)
         self.rng = CounterRng(
             seed,
@@ -161,8 +162,9 @@ class HumanoidEnv(VecEnv):
                 absurd, the environment counts as sick.
 
         Returns:
-            Observations after resets, rewards (N,), dones (N,), and extras with ``time_outs``, ``log``, and the true
-            last observations of the environments that timed out (``final_ids``, ``final_observations``).
+            Observations after resets, rewards (N,), dones (N,), and extras with ``time_outs``, ``log``, the true last
+            observations of the environments that timed out (``final_ids``, ``final_observations``), and how long the
+            physics took [s] (``physics_time``).
         """
         self._last_joint_vel, self._last_contact = self.state.joint_vel, self.state.foot_contact
         self._physics_step(self._act(actions))
@@ -183,7 +185,7 @@ class HumanoidEnv(VecEnv):
 
         self._observe()
         final_ids = (dones if self.final_observations_of_falls else time_outs).nonzero().squeeze(1)
-        extras: dict[str, Any] = {"time_outs": time_outs, "final_ids": final_ids}
+        extras: dict[str, Any] = {"time_outs": time_outs, "final_ids": final_ids, "physics_time": self._physics_time}
         extras["final_observations"] = self.get_observations()[final_ids] if len(final_ids) else self._no_observations
         extras["log"] = self._account(terms, reasons, causes, dones, time_outs)
         reset_ids = dones.nonzero().squeeze(1)
@@ -258,7 +260,9 @@ class HumanoidEnv(VecEnv):
         """Push, help and step every robot."""
         self.randomizer.push(self.common_step_counter, self.penalty_scale, self.step_dt)
         wrench = None if self._harness is None else harness_wrench(self.state, self.robots, self._harness)
+        start = time.perf_counter()
         self._staged = self.pool.step(targets, wrench)
+        self._physics_time = time.perf_counter() - start
 
     def _apply_aids(self) -> None:
         """Spread the aids' scales over the environments, and put the harness' share of the damping in force."""

@@ -11,7 +11,7 @@ from torch import Tensor
 from eagle_rl.config.schema import ControlCfg, RewardsCfg
 from eagle_rl.errors import ConfigError
 
-from .robots.slots import HIP_YAW_SLOTS, LEG_PITCH_SLOTS, NUM_SLOTS, UPPER_SLOTS
+from .robots.slots import HIP_YAW_SLOTS, LEG_PITCH_SLOTS, NUM_SLOTS, UPPER_SLOTS, WAIST_SLOTS
 from .robots.spec import Array, RobotSpec
 from .state import PooledRobots
 
@@ -37,6 +37,7 @@ def action_scale(spec: RobotSpec, cfg: ControlCfg) -> Array:
     bound = np.where(np.isin(slots, LEG_PITCH_SLOTS), cfg.min_effort_ratio_leg_pitch, cfg.min_effort_ratio)
     extra = np.where(np.isin(slots, HIP_YAW_SLOTS), cfg.hip_yaw_ratio, 1.0)
     extra = np.where(np.isin(slots, UPPER_SLOTS), cfg.upper_ratio, extra)
+    extra = np.where(np.isin(slots, WAIST_SLOTS), cfg.waist_ratio, extra)
     ratio = np.clip(spec.effort_limit / spec.stiffness, bound[spec.slots], 1.0)
     return cfg.action_scale * extra * spec.to_slots(ratio)
 

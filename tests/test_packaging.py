@@ -26,7 +26,7 @@ def archives(tmp_path_factory):
     tree = tmp_path_factory.mktemp("tree")
     for name in FILES:
         shutil.copy(ROOT / name, tree)
-    for name in ("eagle_rl", "envs", "cfg", "assets"):
+    for name in ("eagle_rl", "envs", "cfg", "assets", "checkpoints"):
         shutil.copytree(ROOT / name, tree / name, ignore=shutil.ignore_patterns("__pycache__"))
     command = [sys.executable, "setup.py", "--quiet", "sdist", "bdist_wheel"]
     done = subprocess.run(command, cwd=tree, capture_output=True, text=True, check=False)
@@ -41,8 +41,13 @@ def test_the_wheel_works_from_an_empty_folder(archives, tmp_path):
     empty = tmp_path / "empty"
     empty.mkdir()
     environment = {**os.environ, "PYTHONPATH": str(site)}
-    for words in (["train", "smoke", "--show"], ["robots", "check", *known_names("robots")]):
-        command = [sys.executable, "-m", "eagle_rl.cli.main", *words]
+    main = ["-m", "eagle_rl.cli.main"]
+    for words in (
+        [*main, "train", "smoke", "--show"],
+        [*main, "robots", "check", *known_names("robots")],
+        ["-c", "from eagle_rl.cli import play, policy; policy.load_policy(play.PUBLISHED)"],
+    ):
+        command = [sys.executable, *words]
         done = subprocess.run(command, cwd=empty, env=environment, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr
 
@@ -52,6 +57,7 @@ def test_the_wheel_carries_every_data_file_and_no_test(archives):
     names = set(zipfile.ZipFile(wheel).namelist())
     data = {f"eagle_rl/data/{path.relative_to(ROOT).as_posix()}"
             for folder in ("cfg", "assets") for path in (ROOT / folder).rglob("*") if path.is_file()}  # fmt: skip
+    data |= {f"eagle_rl/data/checkpoints/{path.name}" for path in (ROOT / "checkpoints").glob("generalist.*")}
     assert data <= names
     assert not [name for name in names if name.startswith(("tests/", "cfg/", "assets/"))]
 

@@ -25,9 +25,11 @@ from torch import Tensor
 from eagle_rl.algorithms.auxiliary import AuxiliaryLosses, Distill, Estimation, Kickstart, Mirror
 from eagle_rl.algorithms.rollout import Rollout
 from eagle_rl.algorithms.specialists import SpecialistBank
+from eagle_rl.algorithms.stopwatch import Stopwatch
 from eagle_rl.config.schema import AlgoCfg
 from eagle_rl.errors import HealthError
 from eagle_rl.models import EagleActor
+from eagle_rl.models.precision import keep_outputs_exact, multiplies_in_bfloat16
 
 MAX_SKIPPED_STEPS = 3
 """Non-finite gradients in a row after which learning stops."""
@@ -70,9 +72,12 @@ class EaglePPO(PPO):
             max_grad_norm=cfg.max_grad_norm,
             use_clipped_value_loss=cfg.use_clipped_value_loss,
             schedule="fixed",
+            use_mixed_precision=multiplies_in_bfloat16(cfg.precision, device),
             device=device,
             multi_gpu_cfg=multi_gpu_cfg,
         )
+        for model in (actor, critic):
+            keep_outputs_exact(model)
         self.cfg = cfg
         self.is_multi_gpu = True  # makes update() call reduce_parameters(), where gradients are checked
         self.specialists: SpecialistBank | None = None
@@ -81,13 +86,14 @@ class EaglePPO(PPO):
         self.skipped_steps = 0
         self._skipped_in_a_row = 0
         self._withheld_steps = 0
-        self.symmetry = AuxiliaryLosses([])
+        self.stopwatch = Stopwatch()
+        self.symmetry = AuxiliaryLosses([], self.stopwatch)
         groups = [
             {"params": list(actor.parameters()), "lr": cfg.learning_rate},
             {"params": list(critic.parameters()), "lr": cfg.critic_learning_rate},
         ]
         self.optimizer = torch.optim.Adam(groups, fused=True)
-        self.optimizer.register_step_post_hook(lambda *_: self._raw_actor.distribution.project_std())
+        self.optimizer.register_step_post_hook(lambda *_: self._after_step())
 
     @staticmethod
     def construct_algorithm(obs: TensorDict, env: VecEnv, cfg: dict[str, Any], device: str) -> EaglePPO:
@@ -111,6 +117,11 @@ class EaglePPO(PPO):
             self.symmetry.terms.append(
                 Kickstart(lambda: cfg.kickstart_coef * math.exp(-cfg.kickstart_decay * self.num_updates))
             )
+
+    def act(self, obs: TensorDict) -> Tensor:
+        """Sample actions, computed as the update will compute them, so that its importance ratios start at one."""
+        with torch.autocast(torch.device(self.device).type, torch.bfloat16, self.use_mixed_precision):
+            return super().act(obs)
 
     def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: Mapping[str, Any]) -> None:
         """Record one step; a time-out is bootstrapped with the value of its true final observation."""
@@ -147,6 +158,7 @@ class EaglePPO(PPO):
 
         That is where they are not finite, and where the policy has already left the region PPO's loss is good for.
         """
+        self.stopwatch.lap("backward")
         if self.gpu_world_size > 1:
             super().reduce_parameters()
         if self._too_far():
@@ -189,8 +201,12 @@ class EaglePPO(PPO):
             return False
         return self._mean_over_processes(self.symmetry.last_kl.clone()) > MAX_KL_RATIO * self.cfg.desired_kl
 
+    def _after_step(self) -> None:
+        self._raw_actor.distribution.project_std()
+        self.stopwatch.lap("optimiser")
+
     def _adapt_learning_rate(self, kl: float) -> None:
-        """Lower the actor's learning rate where the policy moved too far in the last epoch, raise it where too little."""
+        """Lower the actor's learning rate where the last epoch moved the policy too far, raise it where too little."""
         low, high = self.cfg.learning_rate_range
         if kl > 2 * self.cfg.desired_kl:
             self.learning_rate = max(low, self.learning_rate / LEARNING_RATE_FACTOR)

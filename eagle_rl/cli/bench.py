@@ -30,6 +30,7 @@ PARTS: dict[str, str] = {
     "resources": "memory and start-up of 4096 environments, --help, first iteration",
     "profile": "where the time of an iteration goes",
     "processes": "one process against a process a core, in whole runs",
+    "quality": "time and steps until ppo on G1 alone is good, hours; resumed with the same --run",
 }
 DEFAULT = ("environment", "pooling", "scaling", "iteration", "resources")
 
@@ -45,6 +46,10 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--envs", type=count, default=512, metavar="N", help="environments over all robots [512]")
     parser.add_argument("--threads", type=count, metavar="N", help="physics threads [one a core]")
     parser.add_argument("--seconds", type=float, default=10.0, metavar="S", help="time for each ratio [10]")
+    parser.add_argument("--minutes", type=float, default=60.0, metavar="M", help="longest time for quality [60]")
+    parser.add_argument(
+        "--run", type=Path, default=Path("logs/bench_quality"), metavar="DIR", help="quality's folder [%(default)s]"
+    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures into FILE too")
     return parser
 
@@ -61,10 +66,13 @@ def _import_benchmarks() -> None:
         sys.path.insert(0, str(root))
 
 
-def _measure(part: str, envs: int, threads: int, seconds: float) -> list[Figure]:
+def _measure(part: str, args: argparse.Namespace, threads: int) -> list[Figure]:
     from benchmarks import resources, throughput
     from benchmarks.processes import processes
     from benchmarks.profile import profile
+    from benchmarks.quality import quality_experiment, time_to_quality
+
+    envs, seconds = args.envs, args.seconds
 
     def environment() -> list[Figure]:
         small = throughput.environment(64, threads, seconds / 2, ">= 0.80")
@@ -78,6 +86,7 @@ def _measure(part: str, envs: int, threads: int, seconds: float) -> list[Figure]
         "resources": lambda: resources.large() + resources.answers() + resources.first_iteration(),
         "profile": lambda: profile(envs, threads),
         "processes": lambda: processes(envs, threads),
+        "quality": lambda: time_to_quality(quality_experiment(envs, threads), args.run, args.minutes),
     }
     return measurements[part]()
 
@@ -120,7 +129,7 @@ def main(argv: Sequence[str]) -> int:
     figures: list[Figure] = []
     for part in parts:
         print(f"measuring: {PARTS[part]}", file=sys.stderr)
-        figures += _measure(part, args.envs, threads, args.seconds)
+        figures += _measure(part, args, threads)
     print(_table(machine, figures))
     if args.json is not None:
         args.json.write_text(json.dumps({"machine": machine, "figures": [asdict(f) for f in figures]}, indent=1))

@@ -155,8 +155,9 @@ def _is_result(path: Path) -> bool:
     """Whether a path is a stored result, not the manifest of a policy."""
     from eagle_rl.runners.published import SUFFIX
 
-    manifest = path.name.startswith("model_") or path.with_suffix(SUFFIX).exists()
-    return path.suffix == ".json" and not manifest
+    if path.suffix != ".json":
+        return False
+    return not (path.name.startswith("model_") or path.with_suffix(SUFFIX).exists())
 
 
 def _write(folder: Path, results: Mapping[str, Sequence[EvaluationResult]], table: Table) -> None:

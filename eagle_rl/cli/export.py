@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING
 from eagle_rl._version import __version__
 from eagle_rl.errors import ConfigError
 
+from .policy import load_policy
+
 if TYPE_CHECKING:
     from eagle_rl.config.schema import ExperimentCfg
     from eagle_rl.export.contract import Contract, RobotContract, Term
@@ -102,23 +104,17 @@ def main(argv: Sequence[str]) -> int:
     if args.out is not None and not args.out.absolute().parent.is_dir():
         raise ConfigError(f"--out {args.out}: there is no folder {args.out.parent}. Make it first.")
 
-    from eagle_rl.config.load import experiment_from_plain
     from eagle_rl.export.onnx import export_onnx
-    from eagle_rl.runners.checkpoint import load_actor, publish_policy
-    from eagle_rl.runners.judged import training_steps
-    from eagle_rl.runners.locate import find_checkpoint
-    from eagle_rl.runners.provenance import slot_table_hash
-    from envs.robots.slots import SLOT_NAMES
+    from eagle_rl.runners.checkpoint import publish_policy
 
-    checkpoint = find_checkpoint(args.checkpoint)
+    policy = load_policy(args.checkpoint)
     if args.publish is not None:
-        checkpoint = publish_policy(checkpoint, args.publish, training_steps(checkpoint))
-        print(f"{checkpoint}, with its manifest in {checkpoint.with_suffix('.json').name}")
-    actor, manifest = load_actor(checkpoint, slot_table_hash=slot_table_hash(SLOT_NAMES))
-    cfg = experiment_from_plain(manifest["config"], str(checkpoint))
-    contract = build_contract(cfg, manifest["sha256"], cfg.robots)
-    name = checkpoint.stem if args.publish else f"{checkpoint.stem}_{contract.digest[:8]}"
-    out = args.out or checkpoint.with_name(f"{name}.onnx")
-    difference = export_onnx(actor, contract, out)
+        policy = load_policy(publish_policy(policy.checkpoint, args.publish, policy.env_steps))
+        print(f"{policy.checkpoint}, with its manifest in {policy.checkpoint.with_suffix('.json').name}")
+    contract = build_contract(policy.cfg, policy.sha256, policy.cfg.robots)
+    stem = policy.checkpoint.stem
+    name = stem if args.publish else f"{stem}_{contract.digest[:8]}"
+    out = args.out or policy.checkpoint.with_name(f"{name}.onnx")
+    difference = export_onnx(policy.actor, contract, out)
     print(f"{out}: {', '.join(contract.robots)}; differs from torch by at most {difference:.1g}")
     return 0

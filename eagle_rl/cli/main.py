@@ -5,13 +5,16 @@ Verbs are imported only when called, so that ``--help`` and configuration errors
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import os
 import sys
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 from eagle_rl._version import __version__
-from eagle_rl.errors import EagleError, did_you_mean
+from eagle_rl.errors import EagleError, EagleWarning, did_you_mean
 
 VERBS: dict[str, str] = {
     "train": "run an experiment into a run directory, or resume one",
@@ -47,7 +50,8 @@ def usage() -> str:
 def guarded(action: Callable[[], int]) -> int:
     """Run ``action``; report a user's error in words, and return the exit code."""
     try:
-        return action()
+        with _warnings_in_words():
+            return action()
     except EagleError as error:
         print(f"error: {error}", file=sys.stderr)
         return error.exit_code
@@ -58,10 +62,28 @@ def guarded(action: Callable[[], int]) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except OSError as error:
-        if error.filename is None:
+        if error.strerror is None:
             raise
-        print(f"error: {error.filename}: {error.strerror}.", file=sys.stderr)
+        where = "" if error.filename is None else f"{error.filename}: "
+        print(f"error: {where}{error.strerror}.", file=sys.stderr)
         return EagleError.exit_code
+
+
+@contextlib.contextmanager
+def _warnings_in_words() -> Iterator[None]:
+    """Print our warnings as one line, each time they are given; leave others to Python."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("always", category=EagleWarning)
+        show = warnings.showwarning
+
+        def show_ours(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
+            if issubclass(category, EagleWarning):
+                print(f"warning: {message}", file=sys.stderr)
+            else:
+                show(message, category, *where, **more)
+
+        warnings.showwarning = show_ours
+        yield
 
 
 def run_verb(verb: str, argv: Sequence[str]) -> int:

@@ -14,6 +14,9 @@ from eagle_rl.config.commands import CommandScript, load_commands
 from eagle_rl.config.compose import known_names
 from eagle_rl.config.validate import CONTROL_STEP
 from eagle_rl.errors import CheckpointError, ConfigError
+from eagle_rl.paths import data_root
+
+from .policy import chosen_robots, load_policy
 
 if TYPE_CHECKING:
     from .session import Session
@@ -64,8 +67,8 @@ def has_display() -> bool:
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
-PUBLISHED = Path("checkpoints") / "generalist.safetensors"
-"""The policy that comes with the repository."""
+PUBLISHED = data_root() / "checkpoints" / "generalist.safetensors"
+"""The policy that comes with the package."""
 
 
 def newest_run(logs: Path = Path("logs")) -> Path:
@@ -83,24 +86,11 @@ def newest_run(logs: Path = Path("logs")) -> Path:
 
 def _load(args: argparse.Namespace, checkpoint: Path, seconds: float) -> Session:
     """The policy and its robots, ready to move."""
-    import torch
-
-    from eagle_rl.config.load import experiment_from_plain
-    from eagle_rl.runners.checkpoint import load_actor
-    from eagle_rl.runners.provenance import slot_table_hash
-    from envs.robots.slots import SLOT_NAMES
-
     from .session import Session
 
-    torch.set_num_threads(1)
-    actor, manifest = load_actor(checkpoint, slot_table_hash=slot_table_hash(SLOT_NAMES))
-    cfg = experiment_from_plain(manifest["config"], str(checkpoint))
-    names: Sequence[str] = cfg.robots if args.robots is None else args.robots.split(",")
-    if args.robots == "all":
-        names = known_names("robots")
-    if len(set(names)) < len(names):
-        raise ConfigError(f"--robots {args.robots}: a robot is named twice.")
-    return Session(actor, cfg, names, num_steps=round(seconds / CONTROL_STEP))
+    policy = load_policy(checkpoint)
+    names = chosen_robots(args.robots, policy.cfg)
+    return Session(policy.actor, policy.cfg, names, num_steps=round(seconds / CONTROL_STEP))
 
 
 def main(argv: Sequence[str]) -> int:
@@ -130,7 +120,8 @@ def main(argv: Sequence[str]) -> int:
     checkpoint = find_checkpoint(args.checkpoint or (PUBLISHED if PUBLISHED.is_file() else newest_run()))
     if viewer == "none":
         seconds = args.seconds or script.duration
-        video = args.video if files else checkpoint.with_suffix(".mp4")
+        beside = Path(checkpoint.name) if checkpoint == PUBLISHED else checkpoint
+        video = args.video if files else beside.with_suffix(".mp4")
         film(_load(args, checkpoint, seconds), script, seconds, video, args.contact_sheet)
     else:
         watch = _viewer(viewer)

@@ -82,8 +82,9 @@ def _curves(args: argparse.Namespace) -> dict[str, Figure]:
             if file.exists() or len(stages) == 1:
                 title = f"{name}_{stage}".strip("_").replace("/", "_")
                 panels = read_curves(file, args.smooth)
-                figures[title] = plots.learning_curves(panels)
-                _write(args.out / f"curves_{title}.csv", curves_to_csv(panels))
+                if panels:
+                    figures[title] = plots.learning_curves(panels)
+                    _write(args.out / f"curves_{title}.csv", curves_to_csv(panels))
     return figures
 
 

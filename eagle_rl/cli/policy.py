@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 class Policy:
     """A policy and where it comes from."""
 
+    checkpoint: Path
     actor: EagleActor
     cfg: ExperimentCfg
     """The experiment it was trained in, to be run on the device asked for."""
@@ -31,7 +32,12 @@ class Policy:
 
 
 def load_policy(path: Path, device: str = "cpu") -> Policy:
-    """The policy a path means; on another device than it was trained on, if asked."""
+    """The policy a path means.
+
+    Args:
+        path: checkpoint, stage, run or published policy.
+        device: where it computes, whatever it was trained on.
+    """
     from eagle_rl.config.load import experiment_from_plain
     from eagle_rl.models.precision import set_up_torch
     from eagle_rl.runners.checkpoint import load_actor
@@ -48,7 +54,7 @@ def load_policy(path: Path, device: str = "cpu") -> Policy:
     set_up_torch(1)  # a forward pass is little beside the physics, and waiting threads take the cores from it
     cfg = dataclasses.replace(cfg, run=dataclasses.replace(cfg.run, device=device))
     env_steps = manifest["env_steps"] if checkpoint.suffix == SUFFIX else training_steps(checkpoint)
-    return Policy(actor, cfg, manifest["sha256"], env_steps)
+    return Policy(checkpoint, actor, cfg, manifest["sha256"], env_steps)
 
 
 def chosen_robots(text: str | None, cfg: ExperimentCfg) -> tuple[str, ...]:

@@ -64,7 +64,10 @@ class ControlCfg:
     hip_yaw_ratio: float = 0.5
     """Extra factor at hip yaw [-] (ours, from the single-robot study)."""
     upper_ratio: float = 0.5
-    """Extra factor at waist, head and arms [-] (ours: the noise of a stiff waist turns the pelvis)."""
+    """Extra factor at head and arms [-] (ours)."""
+    waist_ratio: float = 0.5
+    """Extra factor at the waist [-] (ours: the noise of a stiff waist shakes a light pelvis; at 0.5 it makes up half of
+    the yaw-rate error H1 has in training)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -229,6 +232,9 @@ class RewardsCfg:
     orientation against the commanded pitch, so that robots lean."""
     tracking_kappa: float = 0.25
     """kappa of both velocity-tracking terms [m^2/s^2, rad^2/s^2] (paper)."""
+    standing_kappa: float = 0.25
+    """kappa of a second kernel that makes up half of both terms while all velocity commands are zero. Narrower than the
+    first, it rewards standing still at once; drifting at 0.1 m/s costs the first 4 % and ends in a fall (ours)."""
     contact_vel_kappa: float = 5.0
     """[m^2/s^2] (paper)."""
     contact_force_kappa: float = 50.0
@@ -374,7 +380,7 @@ class AlgoCfg:
     learning_rate: float = 1e-3
     learning_rate_range: Range = (1e-5, 2e-3)
     desired_kl: float = 0.01
-    """KL target of the actor's adaptive learning rate, which moves once an iteration (ours: per minibatch it bounced)."""
+    """KL target of the actor's learning rate, which moves once an iteration (ours: per minibatch it bounced)."""
     critic_learning_rate: float = 5e-4
     """Of the critic, fixed (ours): the KL says nothing about the critic, which starved at the actor's 4e-5."""
     entropy_coef: float = 0.002
@@ -397,6 +403,9 @@ class AlgoCfg:
     """alpha of Kickstarting's alpha * exp(-lambda t) * KL(pi_s || pi_g); not given by the paper (ours)."""
     kickstart_decay: float = 0.005
     """lambda per iteration (ours)."""
+    precision: Literal["auto", "float32", "bfloat16"] = "auto"
+    """Of the hidden layers in training; ``auto`` is bfloat16 where the CPU has instructions for it. Parameters,
+    outputs, losses, evaluation and specialists' labels are float32 in any case (docs/performance.md) (ours)."""
     network: NetworkCfg = field(default_factory=NetworkCfg)
 
 

@@ -33,8 +33,9 @@ BOUNDS: dict[str, _Bound] = dict.fromkeys(
     task.commands.resampling_time_s task.commands.curriculum.num_bins_lin_vel_x
     task.commands.curriculum.num_bins_ang_vel_z task.gait.frequency task.gait.contact_smoothing
     task.observations.history_length task.observations.clip
-    task.rewards.tracking_kappa task.rewards.contact_vel_kappa task.rewards.contact_force_kappa
-    task.rewards.foot_slip_kappa task.rewards.foot_swing_clip task.rewards.penalty_interval_steps
+    task.rewards.tracking_kappa task.rewards.standing_kappa task.rewards.contact_vel_kappa
+    task.rewards.contact_force_kappa task.rewards.foot_slip_kappa
+    task.rewards.foot_swing_clip task.rewards.penalty_interval_steps
     task.terminations.episode_length_s task.terminations.max_roll task.terminations.max_pitch
     task.randomization.push_interval_s task.aids.interval_steps
     algo.num_steps_per_env algo.num_learning_epochs algo.num_mini_batches algo.clip_param algo.learning_rate
@@ -53,6 +54,7 @@ BOUNDS |= dict.fromkeys(
     task.commands.curriculum.contact_force_threshold task.commands.curriculum.contact_vel_threshold
     task.gait.phase_offset task.aids.harness_decay task.aids.gait_shaping_decay
     task.aids.min_episode_ratio task.aids.min_contact_match task.aids.harness_contact_match task.control.upper_ratio
+    task.control.waist_ratio
     algo.lam plan.tolerance
     """.split(),
     _SHARE,

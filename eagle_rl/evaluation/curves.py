@@ -62,12 +62,15 @@ def read_curves(metrics: Path, smoothing: int = 1) -> dict[str, list[Curve]]:
     """
     if not metrics.exists():
         raise ConfigError(f"{metrics}: no such file. Name a run or the folder of a stage that has begun to train.")
-    lines = metrics.read_text(encoding="utf-8").splitlines()
-    if metrics.suffix == ".csv":
-        entries = [{key: value for key, value in row.items() if value} for row in csv.DictReader(lines)]
-    else:
-        entries = [json.loads(line) for line in lines if line.endswith("}")]
-    panels = {title: list(_curves(entries, tag, smoothing)) for title, tag in LEARNING_TAGS.items()}
+    try:
+        lines = metrics.read_text(encoding="utf-8").splitlines()
+        if metrics.suffix == ".csv":
+            entries = [{key: value for key, value in row.items() if value} for row in csv.DictReader(lines)]
+        else:
+            entries = [json.loads(line) for line in lines if line.endswith("}")]  # the last may be half written
+        panels = {title: list(_curves(entries, tag, smoothing)) for title, tag in LEARNING_TAGS.items()}
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError, csv.Error) as error:
+        raise ConfigError(f"{metrics}: not the numbers of a run: {error}.") from error
     return {title: curves for title, curves in panels.items() if curves}
 
 

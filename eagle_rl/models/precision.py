@@ -2,9 +2,46 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import torch
+from rsl_rl.modules import MLP
+from torch import Tensor, nn
+
+Precision = Literal["auto", "float32", "bfloat16"]
+
+
+def multiplies_in_bfloat16(precision: Precision, device: torch.device | str) -> bool:
+    """Whether the hidden layers of acting and learning are to multiply in bfloat16.
+
+    ``auto`` does so on CPUs with instructions for it, which take half the time. It asks the processor instead of a
+    clock, so that a resumed run computes what the interrupted one would have.
+    """
+    if precision != "auto":
+        return precision == "bfloat16"
+    capabilities: dict[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()  # torch 2.10 and later
+    return torch.device(device).type == "cpu" and bool(capabilities.get("avx512_bf16"))
+
+
+class OutputLayer(nn.Linear):
+    """A linear layer that computes in the precision of its parameters, under autocast too."""
+
+    def __init__(self, layer: nn.Linear) -> None:
+        """Take over the parameters of ``layer``."""
+        super().__init__(layer.in_features, layer.out_features, device="meta")
+        self.weight, self.bias = layer.weight, layer.bias
+
+    def forward(self, input: Tensor) -> Tensor:
+        """Outputs, shape (N, out_features)."""
+        with torch.autocast(input.device.type, enabled=False):
+            return super().forward(input.to(self.weight.dtype))
+
+
+def keep_outputs_exact(model: nn.Module) -> None:
+    """Let autocast change only the hidden layers of a model's networks, not what leaves them."""
+    for network in list(model.modules()):
+        if isinstance(network, MLP):
+            network[-1] = OutputLayer(network[-1])
 
 
 def set_up_torch(num_threads: int) -> None:

@@ -14,14 +14,14 @@ import json
 import re
 import warnings
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from eagle_rl.errors import CheckpointError
+from eagle_rl.errors import CheckpointError, EagleWarning
 from eagle_rl.models import EagleActor
 from eagle_rl.runners import published
 from eagle_rl.runners.files import write_atomically
@@ -186,6 +186,29 @@ def verify_checkpoint(path: Path) -> Manifest:
     return manifest
 
 
+def misfits(own: Any, saved: Any, where: str) -> Iterator[str]:
+    """What in a saved state has other entries, types or shapes than the live one it is to replace.
+
+    None on either side means "nothing yet" and fits; so do lists of values, which may be of any length.
+    """
+    if own is None or saved is None:
+        return
+    if isinstance(own, dict) and isinstance(saved, dict):
+        for key in own | saved:
+            if key in own and key in saved:
+                yield from misfits(own[key], saved[key], f"{where}.{key}")
+            else:
+                yield f"{where}.{key}: {'unknown here' if key in saved else 'missing'}"
+    elif isinstance(own, torch.Tensor) and isinstance(saved, torch.Tensor):
+        if (own.shape, own.dtype) != (saved.shape, saved.dtype):
+            yield f"{where}: {tuple(saved.shape)} {saved.dtype}, expected {tuple(own.shape)} {own.dtype}"
+    elif isinstance(own, (list, tuple)) and isinstance(saved, (list, tuple)):
+        if any(isinstance(item, torch.Tensor) for item in own):
+            yield from misfits(dict(enumerate(own)), dict(enumerate(saved)), where)
+    elif type(own) is not type(saved):
+        yield f"{where}: {type(saved).__name__}, expected {type(own).__name__}"
+
+
 def latest_checkpoint(folder: Path) -> Path | None:
     """The verified checkpoint of the highest iteration; damaged ones are passed over with a warning."""
     newest_first = sorted(_data_files(folder), key=iteration_of, reverse=True)
@@ -199,14 +222,15 @@ def best_checkpoint(folder: Path) -> Path | None:
 
 
 def prune_checkpoints(folder: Path, keep: int) -> None:
-    """Delete all but the last ``keep``, the best, and the ends of stages; and what an interrupted save left behind."""
+    """Delete all but the last ``keep``, the best, and the ends of stages; and what interrupted saves left behind."""
     manifests = _manifests(folder)
     last = sorted(manifests, key=iteration_of)[-keep:]
     for path in set(manifests) - {*last, best_checkpoint(folder)}:
         if not manifests[path]["stage_end"]:
             path.with_suffix(".json").unlink(missing_ok=True)
             path.unlink(missing_ok=True)
-    for leftover in folder.glob(".model_*.tmp"):
+    never_completed = [path for path in _data_files(folder) if not path.with_suffix(".json").exists()]
+    for leftover in [*never_completed, *folder.glob(".model_*.tmp")]:
         leftover.unlink(missing_ok=True)
 
 
@@ -243,7 +267,7 @@ def _is_sound(path: Path) -> bool:
     try:
         verify_checkpoint(path)
     except CheckpointError as error:
-        warnings.warn(f"Passing over a checkpoint. {error}", stacklevel=3)
+        warnings.warn(f"Passing over a checkpoint. {error}", EagleWarning, stacklevel=3)
         return False
     return True
 

@@ -7,6 +7,7 @@ process is known to be dead, anyone may create the next generation, which exactl
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import socket
@@ -40,14 +41,23 @@ def _process_is_dead(pid: int) -> bool:
     return False
 
 
+def _read(claim: Path) -> tuple[str, int]:
+    """Host and process id of who made a claim; ``?`` and 0 if that cannot be read."""
+    try:
+        made_by = json.loads(claim.read_text(encoding="utf-8"))
+        return str(made_by["host"]), int(made_by["pid"])
+    except (ValueError, KeyError, TypeError):
+        return "?", 0
+
+
 def _is_stale(claim: Path, now: float) -> bool:
     """Whether the claim's holder is gone; ``now`` is the file system's clock."""
     try:
-        holder = json.loads(claim.read_text(encoding="utf-8"))
+        host, pid = _read(claim)
         age = now - claim.stat().st_mtime
     except FileNotFoundError:
         return False
-    return age > STALE_AFTER_S or (holder["host"] == socket.gethostname() and _process_is_dead(holder["pid"]))
+    return age > STALE_AFTER_S or (host == socket.gethostname() and _process_is_dead(pid))
 
 
 def holder(folder: Path) -> str | None:
@@ -56,10 +66,10 @@ def holder(folder: Path) -> str | None:
     if not generations or _is_stale(generations[-1][1], time.time()):
         return None
     try:
-        claim = json.loads(generations[-1][1].read_text(encoding="utf-8"))
+        host, pid = _read(generations[-1][1])
     except FileNotFoundError:
         return None
-    return f"{claim['host']}:{claim['pid']}"
+    return f"{host}:{pid}"
 
 
 class Claim:
@@ -77,8 +87,8 @@ class Claim:
         """Claim a stage's folder, or return None while someone else works on it."""
         folder.mkdir(parents=True, exist_ok=True)
         draft = folder / f".claim-{uuid.uuid4().hex}"
-        draft.write_text(json.dumps({"host": socket.gethostname(), "pid": os.getpid()}), encoding="utf-8")
         try:
+            draft.write_text(json.dumps({"host": socket.gethostname(), "pid": os.getpid()}), encoding="utf-8")
             generations = _generations(folder)
             if generations and not _is_stale(generations[-1][1], draft.stat().st_mtime):
                 return None
@@ -87,13 +97,13 @@ class Claim:
         except FileExistsError:
             return None
         finally:
-            draft.unlink()
+            draft.unlink(missing_ok=True)
         return cls(folder, path)
 
     def check(self) -> None:
-        """Raise unless the claim is still ours."""
+        """Raise if another has taken the claim over; a folder that has vanished was taken over by nobody."""
         generations = _generations(self.folder)
-        if not generations or generations[-1][1] != self.path:
+        if generations and generations[-1][0] > int(self.path.suffix[1:]):
             raise ClaimLostError(f"{self.folder}: taken over by another process")
 
     def __enter__(self) -> Claim:
@@ -108,6 +118,7 @@ class Claim:
         self.path.unlink(missing_ok=True)
 
     def _beat(self) -> None:
-        """Touch the claim until told to stop or it is gone."""
-        while not self._stop.wait(HEARTBEAT_S) and self.path.exists():
-            os.utime(self.path)
+        """Touch the claim until told to stop."""
+        while not self._stop.wait(HEARTBEAT_S):
+            with contextlib.suppress(OSError):  # the folder may vanish and come back
+                os.utime(self.path)

@@ -7,6 +7,7 @@ import dataclasses
 import io
 import os
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -18,10 +19,11 @@ from rsl_rl.runners import OnPolicyRunner
 from eagle_rl.algorithms.eagle_ppo import EaglePPO
 from eagle_rl.algorithms.specialists import SpecialistBank
 from eagle_rl.config.schema import AlgoCfg, RunCfg
-from eagle_rl.errors import CheckpointError, HealthError, Interrupted
+from eagle_rl.errors import CheckpointError, EagleWarning, HealthError, Interrupted
 from eagle_rl.models import EagleActor
 from eagle_rl.models.actor import ACTOR_INPUTS
 from eagle_rl.runners import checkpoint as ckpt
+from eagle_rl.runners.files import patiently
 from eagle_rl.runners.health import SickRule, require_sound
 from eagle_rl.runners.interrupt import InterruptGuard
 from eagle_rl.runners.progress import ProgressReport
@@ -138,19 +140,21 @@ class EagleRunner(OnPolicyRunner):
                     if self._any_process(interrupt.requested):
                         done = self.current_learning_iteration
                         raise Interrupted(f"Interrupted after iteration {done}, saved as {self.save()}.")
-        except HealthError:
+        except HealthError as error:
             if not self.is_distributed:  # the other processes cannot be asked for their part of the state
-                self.save()
+                self._save_before_stopping(error)
             raise
         return self.save(stage_end=True)
 
     def _iterate(self) -> dict[str, float]:
         """Collect one rollout and learn from it; return the iteration's scalars by tag."""
-        start = time.perf_counter()
+        start, cpu_start = time.perf_counter(), time.process_time()
+        self.alg.stopwatch.reset()
         with torch.no_grad():  # not inference_mode: the environment keeps its tensors and may change them in place
             for _ in range(self.cfg["num_steps_per_env"]):
                 self._step()
             self.alg.compute_returns(self._obs)
+            self.alg.stopwatch.lap("storage")
         collected = time.perf_counter()
         losses = self.alg.update()
         learned = time.perf_counter()
@@ -166,10 +170,13 @@ class EagleRunner(OnPolicyRunner):
             "Perf/total_fps": steps / (learned - start),
             "Perf/collection_time": collected - start,
             "Perf/learning_time": learned - collected,
+            "Perf/busy_cores": (time.process_time() - cpu_start) / (learned - start),
             "Perf/env_steps": self.env_steps,
             "Perf/wall_time": self.wall_time,
         }
-        return self.logger.collect() | losses | own
+        logged = self.logger.collect()
+        self.alg.stopwatch.lap("logging")
+        return logged | losses | own | {f"Perf/{name}_time": t for name, t in self.alg.stopwatch.seconds.items()}
 
     def _env_steps_per_robot(self) -> dict[str, int]:
         """Environment steps of each robot in an iteration of this process."""
@@ -179,13 +186,20 @@ class EagleRunner(OnPolicyRunner):
 
     def _step(self) -> None:
         """One control step of every environment."""
+        stopwatch = self.alg.stopwatch
         actions = self.alg.act(self._obs)
+        stopwatch.lap("inference")
         obs, rewards, dones, extras = self.env.step(actions.to(self.env.device))
+        stopwatch.lap("MDP")
+        stopwatch.move(extras.get("physics_time", 0.0), "MDP", "physics")
         self._obs, rewards, dones = obs.to(self.device), rewards.to(self.device), dones.to(self.device)
         tensors = {name: x for name, x in self._obs.items() if x.is_floating_point()} | {"rewards": rewards}
         require_sound(tensors, self.robot, self.env.robot_names)
+        stopwatch.lap("logging")
         self.alg.process_env_step(self._obs, rewards, dones, extras)
+        stopwatch.lap("storage")
         self.logger.add_step(rewards, dones, extras)
+        stopwatch.lap("logging")
 
     def imitate(self, specialists: Sequence[EagleActor], method: Literal["eagle", "kickstart"]) -> None:
         """Learn from one specialist per robot, in the order of the environment's robots, too."""
@@ -197,7 +211,7 @@ class EagleRunner(OnPolicyRunner):
         """Write a checkpoint, unless one holds this state already, and return its path.
 
         Args:
-            stage_end: mark it as the end of its stage, which is never pruned.
+            stage_end: mark it as the end of its stage, which is never pruned; it is waited for while the disk is full.
 
         Returns:
             None in processes that do not write.
@@ -208,21 +222,34 @@ class EagleRunner(OnPolicyRunner):
         self._require_finite_parameters()
         folder = self.folder / "checkpoints"
         try:
-            if self._saved is not None:
-                return ckpt.mark_stage_end(self._saved) if stage_end else self._saved
-            self._saved = ckpt.save_checkpoint(
-                folder,
-                state,
-                self.provenance,
-                iteration=self.current_learning_iteration,
-                env_steps=self.env_steps,
-                score=self._score,
-                stage_end=stage_end,
-            )
-            ckpt.prune_checkpoints(folder, self.cfg["keep_checkpoints"])
+            return patiently(lambda: self._write(folder, state, True)) if stage_end else self._write(folder, state)
         except OSError as error:
-            raise CheckpointError(f"{folder}: the checkpoint could not be written: {error}.") from error
+            raise CheckpointError(
+                f"{folder}: the checkpoint of iteration {self.current_learning_iteration} could not be written: "
+                f"{error.strerror}. The last good checkpoint stays and can be resumed."
+            ) from error
+
+    def _write(self, folder: Path, state: dict[str, Any], stage_end: bool = False) -> Path:
+        if self._saved is not None and self._saved.exists():
+            return ckpt.mark_stage_end(self._saved) if stage_end else self._saved
+        self._saved = ckpt.save_checkpoint(
+            folder,
+            state,
+            self.provenance,
+            iteration=self.current_learning_iteration,
+            env_steps=self.env_steps,
+            score=self._score,
+            stage_end=stage_end,
+        )
+        ckpt.prune_checkpoints(folder, self.cfg["keep_checkpoints"])
         return self._saved
+
+    def _save_before_stopping(self, reason: HealthError) -> None:
+        """Save what there is; where that fails say so, and leave the reason to be told."""
+        try:
+            self.save()
+        except (CheckpointError, HealthError) as error:
+            warnings.warn(f"{error} The run stops because of another fault: {reason}", EagleWarning, stacklevel=2)
 
     def load(self, path: Path | str, *, allow_drift: bool = False) -> None:
         """Go on exactly where a checkpoint was written; nothing changes unless all of it fits.
@@ -252,7 +279,7 @@ class EagleRunner(OnPolicyRunner):
 
     def _state(self) -> dict[str, Any]:
         """Everything a checkpoint holds; the part of each process is gathered in the first."""
-        local = {"env": self.env.state_dict(), "episodes": self.logger.episodes.state_dict(), "rng": self._rng_state()}
+        local = self._local_state()
         processes = [local]
         if self.is_distributed:
             processes = [{}] * self.gpu_world_size
@@ -260,23 +287,33 @@ class EagleRunner(OnPolicyRunner):
         return {
             "architecture": self.alg.actor.architecture,
             "algorithm": self.alg.save(),
-            "runner": {
-                "next_iteration": self.current_learning_iteration,
-                "env_steps": self.env_steps,
-                "wall_time": self.wall_time,
-            },
+            "runner": self._counters(),
             "processes": processes,
+        }
+
+    def _local_state(self) -> dict[str, Any]:
+        """The part of the state that each process has its own of."""
+        episodes = self.logger.episodes.state_dict()
+        return {"env": self.env.state_dict(), "episodes": episodes, "rng": self._rng_state()}
+
+    def _counters(self) -> dict[str, float]:
+        return {
+            "next_iteration": self.current_learning_iteration,
+            "env_steps": self.env_steps,
+            "wall_time": self.wall_time,
         }
 
     def _load_state(self, checkpoint: ckpt.Checkpoint) -> None:
         state = checkpoint.state
-        if len(state["processes"]) != self.gpu_world_size:
+        processes = state.get("processes", ())
+        if len(processes) != self.gpu_world_size:
             raise CheckpointError(
-                f"{checkpoint.path}: written by {len(state['processes'])} processes, resumed by {self.gpu_world_size}. "
+                f"{checkpoint.path}: written by {len(processes)} processes, resumed by {self.gpu_world_size}. "
                 "Resume with as many processes."
             )
         self._require_same_shapes(checkpoint)
-        local = state["processes"][self.gpu_global_rank]
+        local = processes[self.gpu_global_rank]
+        self._require_fit(checkpoint, local)
         self.env.load_state_dict(local["env"])
         self.alg.load(state["algorithm"])
         self.logger.episodes.load_state_dict(local["episodes"])
@@ -300,7 +337,7 @@ class EagleRunner(OnPolicyRunner):
             try:
                 self.save()
             except CheckpointError as error:
-                self.logger.warn(f"{error} Training goes on; the last good checkpoint stays.")
+                self.logger.warn(f"{error} Training goes on.")
 
     def _require_same_shapes(self, checkpoint: ckpt.Checkpoint) -> None:
         """Refuse weights that do not fit, before any is changed."""
@@ -314,6 +351,18 @@ class EagleRunner(OnPolicyRunner):
                     + "\n  ".join(wrong)
                     + "\nUse the algo.network and task.observations it was trained with."
                 )
+
+    def _require_fit(self, checkpoint: ckpt.Checkpoint, local: dict[str, Any]) -> None:
+        """Refuse a state that is not of this environment and learner, before any of it is taken over."""
+        own = {"process": self._local_state(), "runner": self._counters(), "algorithm": self.alg.save()}
+        saved = {"process": local} | {key: checkpoint.state.get(key, {}) for key in ("runner", "algorithm")}
+        for state in (own, saved):  # torch checks the optimiser's itself, which is empty before the first step
+            state["algorithm"] = {k: v for k, v in state["algorithm"].items() if k != "optimizer_state_dict"}
+        wrong = list(ckpt.misfits(own, saved, "state"))
+        if wrong:
+            raise CheckpointError(
+                f"{checkpoint.path}: its state is not one of this run's:\n  " + "\n  ".join(wrong[:10])
+            )
 
     def _require_finite_parameters(self) -> None:
         for model in (self.alg.actor, self.alg.critic):

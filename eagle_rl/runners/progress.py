@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import time
+from collections import defaultdict
 from collections.abc import Mapping
 from types import TracebackType
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from eagle_rl.algorithms.stopwatch import SECTIONS
+
 LINE_INTERVAL_S = 10.0
 """Time between plain lines where the output is not a terminal [s]."""
+BUDGET_INTERVAL = 50
+"""Iterations between lines that say where the time went."""
 
 
 class ProgressReport:
-    """A progress bar with time left on a terminal, a plain line every ten seconds elsewhere."""
+    """A progress bar with time left on a terminal, a plain line every ten seconds elsewhere; where the time goes."""
 
     def __init__(self, title: str, first: int, last: int, console: Console | None = None) -> None:
         """Report on iterations ``first`` to ``last``."""
@@ -23,6 +28,7 @@ class ProgressReport:
         self._console = console or Console(stderr=True)
         self._start = self._last_line = time.monotonic()
         self._bar: Progress | None = None
+        self._seconds: defaultdict[str, float] = defaultdict(float)
 
     def __enter__(self) -> ProgressReport:
         """Draw the bar."""
@@ -54,3 +60,15 @@ class ProgressReport:
             self._last_line = time.monotonic()
             left = (self._last_line - self._start) / (iteration - self._first) * (self._last - iteration)
             self._console.print(f"{text} | {left / 60:.1f} min left", soft_wrap=True, highlight=False)
+        self._count_time(iteration, scalars)
+
+    def _count_time(self, iteration: int, scalars: Mapping[str, float]) -> None:
+        """Add up where the time goes, and say so every ``BUDGET_INTERVAL`` iterations."""
+        for section in SECTIONS:
+            self._seconds[section] += scalars.get(f"Perf/{section}_time", 0.0)
+        total = sum(self._seconds.values())
+        if iteration % BUDGET_INTERVAL == 0 and total > 0:
+            shares = ", ".join(f"{name} {seconds / total:.0%}" for name, seconds in self._seconds.items())
+            busy = f"{scalars['Perf/busy_cores']:.1f} cores busy"
+            self._console.print(f"{self._title} time: {shares} | {busy}", soft_wrap=True, highlight=False)
+            self._seconds.clear()

@@ -84,12 +84,12 @@ class Provenance:
         """What has changed since ``manifest`` was written, one line each; empty if a run can go on bit for bit."""
         now = self.as_manifest()
         keys = ("config", "robots", "robot_hashes", "slot_table_hash", "stage", "parents", "versions")
-        return [line for key in keys for line in _changes(key, manifest.get(key), now[key])]
+        return [line for key in keys for line in changes(key, manifest.get(key), now[key])]
 
 
-def _changes(name: str, old: Any, new: Any) -> list[str]:
+def changes(name: str, old: Any, new: Any) -> list[str]:
     """Leaves that differ, as ``name.key: old -> new``."""
     if isinstance(old, dict) and isinstance(new, dict):
         keys = [*old, *(key for key in new if key not in old)]
-        return [line for key in keys for line in _changes(f"{name}.{key}", old.get(key), new.get(key))]
+        return [line for key in keys for line in changes(f"{name}.{key}", old.get(key), new.get(key))]
     return [] if old == new else [f"{name}: {old} -> {new}"]

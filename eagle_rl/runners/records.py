@@ -5,9 +5,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -44,9 +45,9 @@ def stage_dir(run_dir: Path, stage: str) -> Path:
 
 def write_record(run_dir: Path, stage: str, record: Record) -> None:
     """Store a stage's record."""
-    write_atomically(
-        stage_dir(run_dir, stage) / "stage.json", json.dumps(dataclasses.asdict(record), indent=1).encode()
-    )
+    folder = stage_dir(run_dir, stage)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_atomically(folder / "stage.json", json.dumps(dataclasses.asdict(record), indent=1).encode())
 
 
 def read_record(run_dir: Path, stage: str) -> Record:
@@ -54,7 +55,8 @@ def read_record(run_dir: Path, stage: str) -> Record:
     path = stage_dir(run_dir, stage) / "stage.json"
     if not path.exists():
         return Record()
-    return Record(**json.loads(path.read_text(encoding="utf-8")))
+    with _damage_in_words(path):
+        return Record(**json.loads(path.read_text(encoding="utf-8")))
 
 
 def final_checkpoint(run_dir: Path, stage: str) -> Path:
@@ -84,8 +86,8 @@ def open_plan(
     if path.exists():
         if not resume:
             raise ConfigError(f"{run_dir}: holds a run already. Continue it with --resume, or choose another --out.")
-        begun = json.loads(path.read_text(encoding="utf-8"))["provenance"]
-        changes = provenance.differences(begun)
+        with _damage_in_words(path):
+            changes = provenance.differences(_read_plan_file(run_dir)["provenance"])
         if changes and not allow_drift:
             raise ConfigError([f"{run_dir}: changed since the run was begun; undo it or use --allow-drift.", *changes])
         if not changes:
@@ -95,22 +97,35 @@ def open_plan(
     write_atomically(path, json.dumps(plan, indent=1).encode())
 
 
+@contextlib.contextmanager
+def _damage_in_words(path: Path) -> Iterator[None]:
+    """Say which file it was whose content is not what was written."""
+    try:
+        yield
+    except CheckpointError:
+        raise
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise CheckpointError(f"{path}: damaged: it does not hold what a run writes there.") from error
+
+
 def _read_plan_file(run_dir: Path) -> dict[str, Any]:
     path = run_dir / "plan.json"
     if not path.exists():
-        raise ConfigError(f"{run_dir}: no plan.json, so this is no run of an experiment.")
+        raise CheckpointError(f"{run_dir}: not a run directory: it has no plan.json.")
     return json.loads(path.read_text(encoding="utf-8"))
 
 
 def read_plan(run_dir: Path) -> list[Stage]:
     """The planned stages of a run."""
-    stages = _read_plan_file(run_dir)["stages"]
-    return [Stage(**{**s, "robots": tuple(s["robots"]), "teachers": tuple(s["teachers"])}) for s in stages]
+    with _damage_in_words(run_dir / "plan.json"):
+        stages = _read_plan_file(run_dir)["stages"]
+        return [Stage(**{**s, "robots": tuple(s["robots"]), "teachers": tuple(s["teachers"])}) for s in stages]
 
 
 def read_tolerance(run_dir: Path) -> float:
     """The gain under which a run's rounds stop."""
-    return float(_read_plan_file(run_dir)["provenance"]["config"]["plan"]["tolerance"])
+    with _damage_in_words(run_dir / "plan.json"):
+        return float(_read_plan_file(run_dir)["provenance"]["config"]["plan"]["tolerance"])
 
 
 def converged_round(stages: Sequence[Stage], records: Mapping[str, Record], tolerance: float) -> int | None:

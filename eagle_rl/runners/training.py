@@ -7,10 +7,13 @@ import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+from rich.console import Console
 from rsl_rl.env import VecEnv
 
 from eagle_rl.algorithms.specialists import SpecialistBank
+from eagle_rl.config.load import experiment_from_plain
 from eagle_rl.config.schema import ExperimentCfg
 from eagle_rl.errors import CheckpointError
 from eagle_rl.evaluation.evaluate import MakeEnv, Policy
@@ -20,7 +23,7 @@ from eagle_rl.runners.compass import DemonstrationEnv, ResidualBank, ResidualEnv
 from eagle_rl.runners.locate import find_checkpoint
 from eagle_rl.runners.on_policy import EagleRunner, make_train_cfg
 from eagle_rl.runners.plan import Stage, warm_task
-from eagle_rl.runners.provenance import Provenance
+from eagle_rl.runners.provenance import Provenance, changes
 from eagle_rl.runners.published import SUFFIX
 
 
@@ -119,8 +122,20 @@ def _copy_root(job: Job, checkpoints: Path) -> Path:
     source = find_checkpoint(Path(job.cfg.plan.root or ""))
     if source.suffix == SUFFIX:
         raise CheckpointError(f"plan.root: {source}: a published policy has no critic to go on from; use a checkpoint.")
-    verify_checkpoint(source)
+    manifest = verify_checkpoint(source)
+    _tell_changed_meaning(source, manifest["config"], job.cfg)
     checkpoints.mkdir(parents=True, exist_ok=True)
     for suffix in (".pt", ".json"):  # the manifest last: what has one is complete
         shutil.copyfile(source.with_suffix(suffix), checkpoints / source.with_suffix(suffix).name)
     return checkpoints / source.name
+
+
+def _tell_changed_meaning(root: Path, saved: dict[str, Any], cfg: ExperimentCfg) -> None:
+    """Say what makes a root's observations and actions mean something else here; the weights would fit all the same."""
+    was = experiment_from_plain(saved, str(root)).task
+    parts = ("control", "observations", "gait")
+    lines = [line for p in parts for line in changes(p, *(dataclasses.asdict(getattr(t, p)) for t in (was, cfg.task)))]
+    if lines:
+        listed = "\n  ".join(f"task.{line}" for line in lines)
+        text = f"warning: plan.root {root} was trained with other values, it acts differently here:\n  {listed}"
+        Console(stderr=True).print(text, highlight=False, markup=False, soft_wrap=True)

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-import time
-import warnings
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from statistics import fmean
@@ -18,27 +16,11 @@ from torch import Tensor
 
 from eagle_rl.algorithms.running_means import RunningMeans
 from eagle_rl.runners.event_file import EventFile
-from eagle_rl.runners.files import write_atomically
+from eagle_rl.runners.files import append_whole, write_atomically
+from eagle_rl.runners.throttle import ThrottledWarning
 
 EPISODES = 100
 """Finished episodes of each robot over which rewards and lengths are averaged."""
-WARNING_INTERVAL_S = 60.0
-
-
-class ThrottledWarning:
-    """A warning that is repeated at most once a minute."""
-
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        """Measure time with ``clock`` [s]."""
-        self._clock = clock
-        self._last = -math.inf
-
-    def __call__(self, message: str) -> None:
-        """Warn unless a warning was given within the last minute."""
-        now = self._clock()
-        if now - self._last >= WARNING_INTERVAL_S:
-            self._last = now
-            warnings.warn(message, RuntimeWarning, stacklevel=2)
 
 
 class EpisodeStatistics:
@@ -115,22 +97,19 @@ class TrainingLog:
         """Start writing; what an earlier process wrote beyond the checkpoint it resumes from is dropped."""
         if self.folder is None:
             return
+        self._events = EventFile(self.folder)
         with self._tolerant():
             self.folder.mkdir(parents=True, exist_ok=True)
             self._truncate_metrics(self.folder / "metrics.jsonl", next_iteration)
-            self._events = EventFile(self.folder, next_iteration)
 
     def write(self, iteration: int, scalars: Mapping[str, float]) -> None:
         """Append the scalars of one iteration."""
-        if self.folder is None:
+        if self.folder is None or self._events is None:
             return
         with self._tolerant():
             line = json.dumps({"iteration": iteration} | {k: _json_number(v) for k, v in scalars.items()})
-            with (self.folder / "metrics.jsonl").open("a") as file:
-                file.write(line + "\n")
+            append_whole(self.folder / "metrics.jsonl", line.encode() + b"\n")
         with self._tolerant():
-            if self._events is None:
-                self._events = EventFile(self.folder, iteration)
             self._events.write(iteration, scalars)
 
     def _truncate_metrics(self, path: Path, next_iteration: int) -> None:
@@ -144,7 +123,6 @@ class TrainingLog:
         try:
             yield
         except OSError as error:
-            self._events = None
             self.warn(f"Logging to {self.folder} fails, training goes on: {error}")
 
 

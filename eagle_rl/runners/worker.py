@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 from rich.console import Console
@@ -16,7 +17,7 @@ from eagle_rl.machine import own_cores
 from eagle_rl.models.precision import set_up_torch
 from eagle_rl.runners.checkpoint import load_checkpoint, read_manifest
 from eagle_rl.runners.claims import Claim, ClaimLostError
-from eagle_rl.runners.files import write_atomically
+from eagle_rl.runners.files import patiently, write_atomically
 from eagle_rl.runners.judged import RESULT
 from eagle_rl.runners.plan import Stage
 from eagle_rl.runners.provenance import Provenance
@@ -70,7 +71,7 @@ class Worker:
                 return None
             for stage in todo:
                 if all(records[name].state == "done" for name in stage.inputs):
-                    claim = Claim.acquire(stage_dir(self.run_dir, stage.name))
+                    claim = patiently(partial(Claim.acquire, stage_dir(self.run_dir, stage.name)))
                     if claim is not None:
                         return stage, claim
             time.sleep(POLL_S)
@@ -87,7 +88,7 @@ class Worker:
                 if self.team.size > 1:  # the others are in the middle of it
                     raise
                 return
-            write_record(self.run_dir, stage.name, record)
+            self._record(stage, record)
         if console is not None:
             score = "" if record.score is None else f", tracking score {record.score:.3f}"
             console.print(f"{stage.name}: done, {record.env_steps:,} environment steps{score}", highlight=False)
@@ -120,7 +121,7 @@ class Worker:
     def _train_and_judge(self, job: Job) -> Record:
         """The record of a stage that is done, all but written."""
         inputs = dict(zip(job.stage.inputs, job.provenance.parents, strict=True))
-        write_record(self.run_dir, job.stage.name, Record(state="training", inputs=inputs))
+        self._record(job.stage, Record(state="training", inputs=inputs))
         checkpoint = train(job)
         spent = load_checkpoint(checkpoint).state["runner"]
         root = job.stage.kind == "root"
@@ -132,8 +133,11 @@ class Worker:
             checkpoint=checkpoint.relative_to(self.run_dir).as_posix(),
             sha256=read_manifest(checkpoint)["sha256"],
         )
-        write_record(self.run_dir, job.stage.name, record)
+        self._record(job.stage, record)
         return dataclasses.replace(record, state="done", score=self._judge(job, checkpoint))
+
+    def _record(self, stage: Stage, record: Record) -> None:
+        patiently(lambda: write_record(self.run_dir, stage.name, record))
 
     def _judge(self, job: Job, checkpoint: Path) -> float | None:
         """Evaluate the stage's policy on the fixed seed and keep the result; the pooled score."""
@@ -145,5 +149,5 @@ class Worker:
         result = EvaluationResult(
             checkpoint=read_manifest(checkpoint)["sha256"], protocol=ev, robots=robots, seed=cfg.seed
         )
-        write_atomically(job.folder / RESULT, result.to_json().encode())
+        patiently(lambda: write_atomically(job.folder / RESULT, result.to_json().encode()))
         return pooled_score(robots)

@@ -40,5 +40,6 @@ MIRROR_SIGN = np.array([1.0 if name.endswith("_pitch") else -1.0 for name in SLO
 LEG_PITCH_SLOTS = tuple(i for i, n in enumerate(SLOT_NAMES) if n.endswith(("hip_pitch", "knee_pitch", "ankle_pitch")))
 HIP_YAW_SLOTS = tuple(i for i, n in enumerate(SLOT_NAMES) if n.endswith("hip_yaw"))
 HIP_DEVIATION_SLOTS = tuple(i for i, n in enumerate(SLOT_NAMES) if n.endswith(("hip_roll", "hip_yaw")))
+WAIST_SLOTS = tuple(i for i, n in enumerate(SLOT_NAMES) if n.startswith("waist"))
 UPPER_SLOTS = tuple(range(12, NUM_SLOTS))
 """Every joint that is not a leg: waist, head and arms (HugWBC 4)."""

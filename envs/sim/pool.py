@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -27,9 +28,16 @@ def staging_columns(num_sensors: int) -> dict[str, slice]:
 class PhysicsPool:
     """Steps every robot and gathers their states into one array, copied to the learner's device once per step."""
 
-    def __init__(self, batches: Sequence[RobotBatch], device: torch.device, dtype: torch.dtype) -> None:
-        """Lay out the rows: robots one after another, in the order of ``batches``."""
+    def __init__(
+        self, batches: Sequence[RobotBatch], device: torch.device, dtype: torch.dtype, overlap: bool = False
+    ) -> None:
+        """Lay out the rows: robots one after another, in the order of ``batches``.
+
+        With ``overlap`` two robots are under way at a time: while one's state is checked and gathered, or its last
+        simulations are awaited, the other's physics has the cores. They share nothing, so the results are the same.
+        """
         self.batches = list(batches)
+        self._map: Callable[..., Any] = ThreadPoolExecutor(2, "physics").map if overlap else map
         edges = np.cumsum([0, *(batch.num_envs for batch in batches)]).tolist()
         self.rows = [slice(edges[i], edges[i + 1]) for i in range(len(batches))]
         self.fault_folder: Path | None = None
@@ -56,15 +64,18 @@ class PhysicsPool:
         """
         canonical = targets.to("cpu", torch.float64).numpy()
         forces = None if wrench is None else wrench.to("cpu", torch.float64).numpy()
-        for batch, rows in zip(self.batches, self.rows, strict=True):
+
+        def advance(robot: int) -> None:
+            batch, rows = self.batches[robot], self.rows[robot]
             if forces is not None:
                 batch.apply_base_wrench(forces[rows])
             batch.step(batch.spec.to_native(canonical[rows]))
-        for robot, batch in enumerate(self.batches):
-            sick = batch.causes.nonzero()[0]
-            self._gather_rows(robot, np.flatnonzero(batch.causes == 0) if len(sick) else slice(None))
-            if self.fault_folder is not None:
-                for env in sick.tolist():
+            self._gather_rows(robot, np.flatnonzero(batch.causes == 0) if batch.causes.any() else slice(None))
+
+        list(self._map(advance, range(len(self.batches))))
+        if self.fault_folder is not None:
+            for batch in self.batches:
+                for env in batch.causes.nonzero()[0].tolist():
                     batch.fault(env).save(self.fault_folder)
         return self.staged()
 

@@ -156,7 +156,28 @@ def test_a_file_that_is_no_evaluation_is_refused_by_name(refused, text):
 
 
 def test_status_of_a_folder_that_is_no_run_is_refused(refused):
-    refused(["status", "."], 2, "this is no run of an experiment")
+    refused(["status", "."], 5, "not a run directory: it has no plan.json")
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[]", "{}", '{"stages": [{}]}', '{"stages": 1, "provenance": 2}', "\0", "[" * 10_000]
+)
+@pytest.mark.parametrize("verb", [["status"], ["plot", "curves"], ["plot", "rounds"], ["evaluate"]], ids=" ".join)
+def test_a_run_whose_plan_is_damaged_is_refused_by_name(refused, text, verb):
+    Path("plan.json").write_text(text)
+    refused([*verb, "."], 5, "plan.json: damaged")
+
+
+@pytest.mark.parametrize("text", ["x}", '{"Train/mean_reward/h1": 1}', '[]\n{"a": {}}}', "\xff"])
+def test_numbers_that_no_run_wrote_are_refused_by_name(refused, text):
+    Path("metrics.jsonl").write_bytes(text.encode("latin1"))
+    refused(["plot", "curves", "."], 2, "metrics.jsonl: not the numbers of a run")
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"Train/mean_rew'])
+def test_where_no_numbers_are_yet_it_is_said_so(refused, text):
+    Path("metrics.jsonl").write_text(text)
+    refused(["plot", "curves", "."], 2, ".: nothing to draw yet")
 
 
 def test_a_file_the_system_refuses_is_named_without_a_traceback(refused, monkeypatch):

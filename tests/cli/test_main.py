@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import types
+import warnings
 
 import pytest
 
@@ -39,6 +40,39 @@ def test_each_kind_of_stop_has_its_exit_code_and_no_traceback(verb, error, code,
     message = capsys.readouterr().err
     assert "Traceback" not in message
     assert all(line in message for line in str(error).splitlines())
+
+
+def test_a_warning_is_one_line_each_time_it_is_given(verb, capsys):
+    def warn(argv):
+        for _ in range(2):
+            warnings.warn("the disk is full", errors.EagleWarning, stacklevel=2)
+        return 0
+
+    verb.main = warn
+    filters = list(warnings.filters)
+    assert cli.main(["stub"]) == 0
+    assert capsys.readouterr().err == 2 * "warning: the disk is full\n"
+    assert warnings.filters == filters
+
+
+def test_other_warnings_are_left_to_python(verb):
+    def warn(argv):
+        warnings.warn("odd", RuntimeWarning, stacklevel=2)
+        return 0
+
+    verb.main = warn
+    with pytest.warns(RuntimeWarning, match="odd"):
+        assert cli.main(["stub"]) == 0
+
+
+@pytest.mark.parametrize("words", [(28, "No space left"), (28, "No space left", "table.md")])
+def test_what_the_system_refuses_is_said_in_words(verb, words, capsys):
+    def full(argv):
+        raise OSError(*words)
+
+    verb.main = full
+    assert cli.main(["stub"]) == 2
+    assert capsys.readouterr().err == f"error: {'table.md: ' if len(words) == 3 else ''}No space left.\n"
 
 
 def test_a_fault_of_ours_is_not_hidden(verb):

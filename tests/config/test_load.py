@@ -151,7 +151,7 @@ def test_a_wrong_override_is_named_with_what_was_expected(override, expected):
         ("algo.network.actor_dims=[1000000000]", "of at most 100000"),
         ("algo.num_mini_batches=7", "7 does not divide the batch of num_envs 320 x num_steps_per_env 24 = 7680"),
         ("algo.learning_rate=0.1", "0.1 is outside learning_rate_range [1e-05, 0.002]"),
-        ("algo.network.init_std=2", "2 is outside std_range [0.1, 1.2]"),
+        ("algo.network.init_std=2", "2 is outside std_range [0.1, 0.6]"),
         ("algo.network.actor_dims=[64, 0]", "expected numbers above 0"),
         ("task.commands.ang_vel_z.initial=[-2, 2]", "the curriculum only widens"),
         ("task.observations.scan_x=[0, 1, 0]", "at least one point"),

@@ -89,8 +89,9 @@ def test_a_restored_state_continues_bit_for_bit() -> None:
     assert np.array_equal(first.state(), second.state())
 
 
-def make_pool(*names: str) -> PhysicsPool:
-    return PhysicsPool([make_batch(name, num_envs=2) for name in names], torch.device("cpu"), torch.float64)
+def make_pool(*names: str, overlap: bool = False) -> PhysicsPool:
+    batches = [make_batch(name, num_envs=2) for name in names]
+    return PhysicsPool(batches, torch.device("cpu"), torch.float64, overlap)
 
 
 def test_the_pool_gathers_canonical_angles_into_slots() -> None:
@@ -107,6 +108,19 @@ def test_the_pool_gathers_canonical_angles_into_slots() -> None:
         assert not joint_pos[:, ~spec.slot_mask].any(), "absent slots"
         assert np.allclose(block[:, pool.columns["joint_vel"]], spec.to_slots(spec.signs * batch.qvel[:, 6:]))
         assert np.allclose(block[:, pool.columns["joint_torque"]], spec.to_slots(spec.signs * batch.joint_torque))
+
+
+def test_robots_stepped_side_by_side_give_the_same_bits_as_one_after_another() -> None:
+    pools = [make_pool("h1", "t1", "n1", overlap=overlap) for overlap in (False, True)]
+    generator = torch.Generator().manual_seed(0)
+    for step in range(10):
+        goal = 0.3 * torch.randn(6, 32, generator=generator, dtype=torch.float64)
+        goal[2, 0] = torch.nan if step == 5 else 0.0
+        wrench = torch.randn(6, 6, generator=generator, dtype=torch.float64)
+        one, other = (pool.step(goal, wrench) for pool in pools)
+        assert torch.equal(one, other), f"step {step}"
+        assert torch.equal(*(pool.causes() for pool in pools))
+        assert bool(pools[0].causes()[2]) == (step == 5)
 
 
 def test_pool_rows_are_split_by_robot() -> None:

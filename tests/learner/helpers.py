@@ -18,7 +18,7 @@ torch.set_num_threads(1)
 NETWORK = NetworkCfg(
     embedding_dim=8, encoder_dims=(32,), estimator_dims=(16,), actor_dims=(32, 32), critic_dims=(32, 32), init_std=0.5
 )
-ALGO = AlgoCfg(network=NETWORK, gamma=0.9, num_steps_per_env=8, entropy_coef=0.0)
+ALGO = AlgoCfg(network=NETWORK, precision="float32", gamma=0.9, num_steps_per_env=8, entropy_coef=0.0)
 
 
 def make_runner(

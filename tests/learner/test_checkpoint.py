@@ -8,12 +8,13 @@ import random
 import subprocess
 import sys
 import zipfile
+from importlib import metadata
 from pathlib import Path
 
 import pytest
 import torch
 
-from eagle_rl.errors import CheckpointError
+from eagle_rl.errors import CheckpointError, EagleWarning
 from eagle_rl.runners import checkpoint as ckpt
 from eagle_rl.runners.files import write_atomically
 from eagle_rl.runners.provenance import Provenance, slot_table_hash
@@ -46,8 +47,11 @@ def test_what_was_saved_is_loaded_with_its_manifest(tmp_path):
     assert manifest == loaded.manifest | {"digest": manifest["digest"]}
     expected = {"iteration": 12, "env_steps": 120, "score": 3.5, "stage": "train", "config": {"name": "toy"}}
     assert expected.items() <= manifest.items()
+    named = """format file bytes sha256 iteration env_steps score stage_end config config_hash robots robot_hashes
+        slot_table_hash stage parents drifted versions git_commit digest"""
+    assert set(named.split()) == set(manifest)
     assert manifest["bytes"] == path.stat().st_size
-    assert manifest["versions"]["torch"] == torch.__version__
+    assert manifest["versions"]["torch"] == metadata.version("torch")
 
 
 @pytest.mark.parametrize("suffix", [".pt", ".json"])
@@ -143,10 +147,10 @@ def test_the_newest_is_found_by_number_and_falls_back_to_the_previous_good_one(t
         save(tmp_path, iteration)
     assert ckpt.latest_checkpoint(tmp_path).name == "model_1000.pt"
     (tmp_path / "model_1000.pt").write_bytes(b"damaged")
-    with pytest.warns(UserWarning, match=r"Passing over a checkpoint.*model_1000"):
+    with pytest.warns(EagleWarning, match=r"Passing over a checkpoint.*model_1000"):
         assert ckpt.latest_checkpoint(tmp_path).name == "model_100.pt"
     (tmp_path / "model_100.json").unlink()
-    with pytest.warns(UserWarning, match="model_100"):
+    with pytest.warns(EagleWarning, match="model_100"):
         assert ckpt.latest_checkpoint(tmp_path).name == "model_9.pt"
 
 
@@ -155,6 +159,7 @@ def test_pruning_keeps_the_last_the_best_and_the_ends_of_stages(tmp_path):
     for iteration, score in scores.items():
         save(tmp_path, iteration, score=score, stage_end=iteration == 3)
     (tmp_path / ".model_8.pt.77.tmp").write_bytes(b"left by a kill")
+    (tmp_path / "model_9.pt").write_bytes(b"left by a disk that was full before the manifest")
     ckpt.prune_checkpoints(tmp_path, keep=2)
     assert sorted(p.name for p in tmp_path.glob("*.pt")) == [f"model_{i}.pt" for i in (2, 3, 6, 7)]
     assert sorted(p.name for p in tmp_path.glob("*.json")) == [f"model_{i}.json" for i in (2, 3, 6, 7)]

@@ -4,6 +4,8 @@ import pytest
 import torch
 
 from eagle_rl.models import precision
+from eagle_rl.runners.on_policy import EagleRunner
+from tests.learner.helpers import collect, make_runner
 
 
 @pytest.mark.parametrize("shape", [(1920, 510, 256), (64, 174, 256), (1, 33, 64)])
@@ -24,3 +26,48 @@ def test_a_processor_that_rounds_to_bfloat16_is_found_out(monkeypatch):
     monkeypatch.setattr(torch.Tensor, "__matmul__", rounded)
     precision.set_up_torch(1)
     assert torch.backends.mkldnn.matmul.fp32_precision == "ieee"
+
+
+@pytest.mark.parametrize("has", [True, False])
+def test_auto_is_bfloat16_where_the_processor_has_it(monkeypatch, has):
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": has}, raising=False)
+    assert precision.multiplies_in_bfloat16("auto", "cpu") is has
+    assert not precision.multiplies_in_bfloat16("auto", "cuda:0")
+    assert precision.multiplies_in_bfloat16("bfloat16", "cuda:0")
+    assert not precision.multiplies_in_bfloat16("float32", "cpu")
+
+
+def gradient(runner: EagleRunner) -> torch.Tensor:
+    """What one update of the whole rollout leaves in the parameters."""
+    runner.alg.update()
+    models = (runner.alg.actor, runner.alg.critic)
+    return torch.cat([p.grad.flatten() for model in models for p in model.parameters()])
+
+
+def test_bfloat16_changes_the_gradient_by_its_rounding_and_no_more():
+    one_step = {"num_learning_epochs": 1, "num_mini_batches": 1, "learning_rate": 0.0, "max_grad_norm": 1e9}
+    exact, rounded = (make_runner(precision=name, **one_step) for name in ("float32", "bfloat16"))
+    for runner in (exact, rounded):
+        collect(runner)
+    rounded.alg.storage = exact.alg.storage
+    storage = {key: x.clone() for key, x in vars(exact.alg.storage).items() if isinstance(x, torch.Tensor)}
+    expected = gradient(exact)
+    vars(exact.alg.storage).update(storage)
+    found = gradient(rounded)
+    error = (found - expected).norm() / expected.norm()
+    assert 0 < error < 0.05, "relative error of the gradient; zero means that nothing was rounded"
+
+
+def test_importance_ratios_start_at_one_and_outputs_are_float32():
+    """What acted and what learns round alike: a difference would look like a policy that has moved."""
+    runner = make_runner(precision="bfloat16")
+    collect(runner)
+    alg = runner.alg
+    batch = next(alg.storage.mini_batch_generator(4, 1))
+    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+        alg.actor(batch.observations, stochastic_output=True)
+        log_ratio = alg.actor.get_output_log_prob(batch.actions) - batch.old_actions_log_prob[:, 0]
+        values = alg.critic(batch.observations)
+    assert log_ratio.abs().max() < 0.01
+    for output in (alg.actor.output_mean, alg.actor.embedding, alg.actor.estimate, values):
+        assert output.dtype == torch.float32

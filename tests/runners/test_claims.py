@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import socket
+import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -76,6 +78,25 @@ def test_the_holder_keeps_its_claim_alive(tmp_path, monkeypatch):
     with claim:
         while claim.path.stat().st_mtime == 0:
             pass
+
+
+def test_a_folder_that_vanished_was_taken_over_by_nobody(tmp_path, monkeypatch):
+    monkeypatch.setattr(claims, "HEARTBEAT_S", 0.01)
+    with Claim.acquire(tmp_path / "stage") as claim:
+        shutil.rmtree(tmp_path / "stage")
+        time.sleep(0.05)
+        claim.check()
+        assert claim._thread.is_alive()
+
+
+@pytest.mark.parametrize("text", ["", "[]", '{"host": 1, "pid": "x"}'])
+def test_a_claim_that_says_nothing_is_respected_while_it_is_fresh(tmp_path, text):
+    (tmp_path / "claim.0").write_text(text)
+    assert Claim.acquire(tmp_path) is None
+    assert claims.holder(tmp_path) == "?:0"
+    os.utime(tmp_path / "claim.0", (0, 0))
+    assert claims.holder(tmp_path) is None
+    assert Claim.acquire(tmp_path) is not None
 
 
 def test_nothing_is_left_behind(tmp_path):

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
-from eagle_rl.errors import CheckpointError, ConfigError
+from eagle_rl.errors import CheckpointError, ConfigError, EagleWarning
 from eagle_rl.evaluation.evaluate import EvaluationResult
 from eagle_rl.runners.checkpoint import load_checkpoint
 from eagle_rl.runners.claims import Claim, ClaimLostError
 from eagle_rl.runners.records import read_record, stage_dir
 from eagle_rl.runners.stages import run_experiment
-from tests.runners.toy_run import ENVS, STEPS, make_toy_env, parameters, toy_experiment
+from tests.runners.toy_run import ENVS, STEPS, JudgedToyEnv, make_toy_env, parameters, toy_experiment
 
 
 @pytest.fixture(scope="module")
@@ -105,6 +107,27 @@ def test_a_worker_whose_stage_was_taken_over_leaves_it_unrecorded_and_goes_on(tm
     assert result.records["round1/distill"].state == "done"
 
 
+def test_a_run_whose_folder_vanishes_goes_on_to_its_end(tmp_path):
+    class Vandal(JudgedToyEnv):
+        steps = 0
+
+        def step(self, actions):
+            self.steps += 1
+            if self.steps == 2 * STEPS + 2:  # in the third iteration, two checkpoints written
+                shutil.rmtree(tmp_path / "run")
+            return super().step(actions)
+
+    with pytest.warns(EagleWarning, match="training goes on") as caught:
+        result = run_experiment(
+            toy_experiment(iterations=5, judge_envs=0, method="ppo"),
+            tmp_path / "run",
+            lambda robots, num_envs, task, seed: Vandal(num_envs, tuple(robots), seed),
+        )
+    assert len(caught) == 1, "once a minute"
+    assert load_checkpoint(result.generalist).manifest["iteration"] == 5
+    assert result.records["generalist"].state == "done"
+
+
 def test_rounds_stop_when_the_score_no_longer_improves(tmp_path):
     result = run_experiment(toy_experiment(iterations=1, max_rounds=3, tolerance=10.0), tmp_path / "run", make_toy_env)
     assert result.records["round1/distill"].state == "done"
@@ -127,6 +150,16 @@ def test_ppo_continued_forks_from_a_root_with_fresh_counters(finished, tmp_path)
     assert result.records["root"].sha256 == finished.records["generalist"].sha256
     assert result.records["root"].env_steps == 0
     assert result.env_steps == 2 * ENVS * STEPS
+
+
+def test_a_root_trained_with_other_actions_is_told(finished, tmp_path, capsys):
+    root = finished.run_dir / finished.records["generalist"].checkpoint
+    cfg = toy_experiment(iterations=1, judge_envs=0, method="ppo", root=str(root))
+    run_experiment(cfg, tmp_path / "same", make_toy_env)
+    assert "warning" not in capsys.readouterr().err
+    control = replace(cfg.task.control, waist_ratio=0.125)
+    run_experiment(replace(cfg, task=replace(cfg.task, control=control)), tmp_path / "other", make_toy_env)
+    assert "task.control.waist_ratio: 0.5 -> 0.125" in capsys.readouterr().err
 
 
 def test_kickstarting_distils_with_its_own_loss(finished, tmp_path):
