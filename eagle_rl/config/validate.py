@@ -33,8 +33,9 @@ BOUNDS: dict[str, _Bound] = dict.fromkeys(
     task.commands.resampling_time_s task.commands.curriculum.num_bins_lin_vel_x
     task.commands.curriculum.num_bins_ang_vel_z task.gait.frequency task.gait.contact_smoothing
     task.observations.history_length task.observations.clip
-    task.rewards.tracking_kappa task.rewards.contact_vel_kappa task.rewards.contact_force_kappa
-    task.rewards.foot_slip_kappa task.rewards.foot_swing_clip task.rewards.penalty_interval_steps
+    task.rewards.tracking_kappa task.rewards.standing_kappa task.rewards.contact_vel_kappa
+    task.rewards.contact_force_kappa task.rewards.foot_slip_kappa
+    task.rewards.foot_swing_clip task.rewards.penalty_interval_steps
     task.terminations.episode_length_s task.terminations.max_roll task.terminations.max_pitch
     task.randomization.push_interval_s task.aids.interval_steps
     algo.num_steps_per_env algo.num_learning_epochs algo.num_mini_batches algo.clip_param algo.learning_rate

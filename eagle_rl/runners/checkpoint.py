@@ -14,7 +14,7 @@ import json
 import re
 import warnings
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -184,6 +184,29 @@ def verify_checkpoint(path: Path) -> Manifest:
     manifest = read_manifest(path)
     _read_verified(Path(path).with_suffix(".pt"), manifest)
     return manifest
+
+
+def misfits(own: Any, saved: Any, where: str) -> Iterator[str]:
+    """What in a saved state has other entries, types or shapes than the live one it is to replace.
+
+    None on either side means "nothing yet" and fits; so do lists of values, which may be of any length.
+    """
+    if own is None or saved is None:
+        return
+    if isinstance(own, dict) and isinstance(saved, dict):
+        for key in own | saved:
+            if key in own and key in saved:
+                yield from misfits(own[key], saved[key], f"{where}.{key}")
+            else:
+                yield f"{where}.{key}: {'unknown here' if key in saved else 'missing'}"
+    elif isinstance(own, torch.Tensor) and isinstance(saved, torch.Tensor):
+        if (own.shape, own.dtype) != (saved.shape, saved.dtype):
+            yield f"{where}: {tuple(saved.shape)} {saved.dtype}, expected {tuple(own.shape)} {own.dtype}"
+    elif isinstance(own, (list, tuple)) and isinstance(saved, (list, tuple)):
+        if any(isinstance(item, torch.Tensor) for item in own):
+            yield from misfits(dict(enumerate(own)), dict(enumerate(saved)), where)
+    elif type(own) is not type(saved):
+        yield f"{where}: {type(saved).__name__}, expected {type(own).__name__}"
 
 
 def latest_checkpoint(folder: Path) -> Path | None:

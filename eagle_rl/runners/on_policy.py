@@ -279,7 +279,7 @@ class EagleRunner(OnPolicyRunner):
 
     def _state(self) -> dict[str, Any]:
         """Everything a checkpoint holds; the part of each process is gathered in the first."""
-        local = {"env": self.env.state_dict(), "episodes": self.logger.episodes.state_dict(), "rng": self._rng_state()}
+        local = self._local_state()
         processes = [local]
         if self.is_distributed:
             processes = [{}] * self.gpu_world_size
@@ -287,23 +287,33 @@ class EagleRunner(OnPolicyRunner):
         return {
             "architecture": self.alg.actor.architecture,
             "algorithm": self.alg.save(),
-            "runner": {
-                "next_iteration": self.current_learning_iteration,
-                "env_steps": self.env_steps,
-                "wall_time": self.wall_time,
-            },
+            "runner": self._counters(),
             "processes": processes,
+        }
+
+    def _local_state(self) -> dict[str, Any]:
+        """The part of the state that each process has its own of."""
+        episodes = self.logger.episodes.state_dict()
+        return {"env": self.env.state_dict(), "episodes": episodes, "rng": self._rng_state()}
+
+    def _counters(self) -> dict[str, float]:
+        return {
+            "next_iteration": self.current_learning_iteration,
+            "env_steps": self.env_steps,
+            "wall_time": self.wall_time,
         }
 
     def _load_state(self, checkpoint: ckpt.Checkpoint) -> None:
         state = checkpoint.state
-        if len(state["processes"]) != self.gpu_world_size:
+        processes = state.get("processes", ())
+        if len(processes) != self.gpu_world_size:
             raise CheckpointError(
-                f"{checkpoint.path}: written by {len(state['processes'])} processes, resumed by {self.gpu_world_size}. "
+                f"{checkpoint.path}: written by {len(processes)} processes, resumed by {self.gpu_world_size}. "
                 "Resume with as many processes."
             )
         self._require_same_shapes(checkpoint)
-        local = state["processes"][self.gpu_global_rank]
+        local = processes[self.gpu_global_rank]
+        self._require_fit(checkpoint, local)
         self.env.load_state_dict(local["env"])
         self.alg.load(state["algorithm"])
         self.logger.episodes.load_state_dict(local["episodes"])
@@ -341,6 +351,18 @@ class EagleRunner(OnPolicyRunner):
                     + "\n  ".join(wrong)
                     + "\nUse the algo.network and task.observations it was trained with."
                 )
+
+    def _require_fit(self, checkpoint: ckpt.Checkpoint, local: dict[str, Any]) -> None:
+        """Refuse a state that is not of this environment and learner, before any of it is taken over."""
+        own = {"process": self._local_state(), "runner": self._counters(), "algorithm": self.alg.save()}
+        saved = {"process": local} | {key: checkpoint.state.get(key, {}) for key in ("runner", "algorithm")}
+        for state in (own, saved):  # torch checks the optimiser's itself, which is empty before the first step
+            state["algorithm"] = {k: v for k, v in state["algorithm"].items() if k != "optimizer_state_dict"}
+        wrong = list(ckpt.misfits(own, saved, "state"))
+        if wrong:
+            raise CheckpointError(
+                f"{checkpoint.path}: its state is not one of this run's:\n  " + "\n  ".join(wrong[:10])
+            )
 
     def _require_finite_parameters(self) -> None:
         for model in (self.alg.actor, self.alg.critic):

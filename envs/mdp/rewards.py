@@ -67,14 +67,22 @@ def _square_sum(x: Tensor) -> Tensor:
     return _dot(x, x)
 
 
+def _tracking(squared_error: Tensor, state: PooledState, cfg: RewardsCfg) -> Tensor:
+    """``rho`` of a velocity's error; while standing the mean of that and of a narrower ``rho``, see the schema."""
+    wide = _rho(squared_error, cfg.tracking_kappa)
+    if cfg.standing_kappa == cfg.tracking_kappa:
+        return wide
+    return torch.where(state.standing, 0.5 * (wide + _rho(squared_error, cfg.standing_kappa)), wide)
+
+
 def lin_vel_tracking(state: PooledState, robots: PooledRobots, ctx: RewardContext) -> Tensor:
     """``rho(|v_xy* - v_xy|^2)`` in the base frame [-], a reward (Lin. vel. tracking)."""
-    return _rho(_square_sum(state.command[:, :2] - state.base_lin_vel_b[:, :2]), ctx.cfg.tracking_kappa)
+    return _tracking(_square_sum(state.command[:, :2] - state.base_lin_vel_b[:, :2]), state, ctx.cfg)
 
 
 def ang_vel_tracking(state: PooledState, robots: PooledRobots, ctx: RewardContext) -> Tensor:
     """``rho((omega_z* - omega_z)^2)`` in the base frame [-], a reward (Ang. vel. tracking)."""
-    return _rho((state.command[:, 2] - state.base_ang_vel_b[:, 2]).square(), ctx.cfg.tracking_kappa)
+    return _tracking((state.command[:, 2] - state.base_ang_vel_b[:, 2]).square(), state, ctx.cfg)
 
 
 def base_height(state: PooledState, robots: PooledRobots, ctx: RewardContext) -> Tensor:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 
 import pytest
 
 from eagle_rl.cli.main import run_verb
+from eagle_rl.runners.checkpoint import load_checkpoint
 from eagle_rl.runners.locate import find_checkpoint
+from envs.humanoid_env import HumanoidEnv
+from tests.learner.test_runner import compare
 
 
 @pytest.fixture(scope="module")
@@ -55,6 +59,29 @@ def test_a_run_resumed_with_another_value_is_refused_and_left_alone(run_dir, cap
     assert run_verb("train", ["--resume", str(run_dir), "algo.gamma=0.9"]) == 2
     assert "config.algo.gamma: 0.99 -> 0.9" in capsys.readouterr().err
     assert files(run_dir) == before
+
+
+def test_a_run_interrupted_and_resumed_ends_with_the_same_bits(tmp_path, monkeypatch):
+    words = ["smoke", "robots=[t1]", "num_envs=2", "plan.method=ppo", "plan.judge_envs_per_robot=0", "--out"]
+    assert run_verb("train", [*words, str(tmp_path / "whole")]) == 0
+    steps, step = [], HumanoidEnv.step
+
+    def interrupted(env, actions):
+        steps.append(1)
+        if len(steps) == 30:  # in the fourth of ten iterations and in mid-episode
+            signal.raise_signal(signal.SIGTERM)
+        return step(env, actions)
+
+    monkeypatch.setattr(HumanoidEnv, "step", interrupted)
+    assert run_verb("train", [*words, str(tmp_path / "cut")]) == 130
+    (cut,) = (tmp_path / "cut" / "smoke").iterdir()
+    assert find_checkpoint(cut).name == "model_4.pt"
+    assert run_verb("train", ["--resume", str(cut)]) == 0
+    (whole,) = (tmp_path / "whole" / "smoke").iterdir()
+    ends = [load_checkpoint(find_checkpoint(run)).state for run in (whole, cut)]
+    for end in ends:
+        end["runner"].pop("wall_time")
+    compare(*ends, "state")
 
 
 def test_status_shows_every_stage_done(run_dir, capsys):

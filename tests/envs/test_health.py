@@ -59,7 +59,8 @@ def test_bad_numbers_are_caught_in_the_same_step_and_nobody_else_changes(where: 
     observations, rewards, dones, extras = second
     assert dones.tolist() == [i == SICK for i in range(5)]
     assert rewards[SICK] == 0.0
-    assert not extras["time_outs"].any()
+    assert not extras["time_outs"].any(), "nothing is expected of its future"
+    assert spoiled.episode_count.tolist() == [1 + (i == SICK) for i in range(5)], "redrawn at once"
     assert all(torch.isfinite(x).all() for x in observations.values())
     for step in range(STEPS, STEPS + 15):
         assert_same(first[0], second[0], f"{value} in {where} of another environment", OTHERS)

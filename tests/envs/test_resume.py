@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
+import os
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -100,6 +105,26 @@ def test_everything_happened_that_the_resume_test_is_about() -> None:
 
 def test_resumes_without_randomization_and_in_double_precision() -> None:
     assert_continues(lambda: make_env(task=BARE, dtype=torch.float64), 30, LOG_INTERVAL)
+
+
+def digest() -> str:
+    """Of everything a few busy steps return."""
+    sha = hashlib.sha256()
+    for observations, rewards, dones, _ in run(make_env(task=BUSY), range(20)):
+        for tensor in (*(observations[key] for key in sorted(observations.keys())), rewards, dones):
+            sha.update(tensor.numpy().tobytes())
+    return sha.hexdigest()
+
+
+@pytest.mark.slow
+def test_another_process_simulates_the_same_bits() -> None:
+    code = "from tests.envs.test_resume import digest; print(digest())"
+    root = Path(__file__).parents[2]
+    environment = os.environ | {"PYTHONHASHSEED": "12345", "PYTHONPATH": str(root)}  # sets are ordered otherwise there
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=root, env=environment, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == digest()
 
 
 def test_a_state_can_be_loaded_twice() -> None:

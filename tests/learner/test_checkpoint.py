@@ -47,6 +47,9 @@ def test_what_was_saved_is_loaded_with_its_manifest(tmp_path):
     assert manifest == loaded.manifest | {"digest": manifest["digest"]}
     expected = {"iteration": 12, "env_steps": 120, "score": 3.5, "stage": "train", "config": {"name": "toy"}}
     assert expected.items() <= manifest.items()
+    named = """format file bytes sha256 iteration env_steps score stage_end config config_hash robots robot_hashes
+        slot_table_hash stage parents drifted versions git_commit digest"""
+    assert set(named.split()) == set(manifest)
     assert manifest["bytes"] == path.stat().st_size
     assert manifest["versions"]["torch"] == metadata.version("torch")
 

@@ -97,6 +97,7 @@ def test_paper_mode_has_the_printed_kernels() -> None:
     cfg = RewardsCfg(orientation="upright")
     kappas = (cfg.tracking_kappa, cfg.contact_vel_kappa, cfg.contact_force_kappa, cfg.foot_slip_kappa)
     assert kappas == (0.25, 5, 50, 1)
+    assert cfg.standing_kappa == cfg.tracking_kappa
 
 
 def test_terms_and_weights_have_the_same_names() -> None:
@@ -117,6 +118,16 @@ def test_standing_still_costs_nothing() -> None:
 def test_lin_vel_tracking() -> None:
     state = state_with(command=[0.5, 0.1, 0, 0, 0], base_lin_vel_b=[0.2, -0.3, 9.0])
     assert value("lin_vel_tracking", state) == pytest.approx(math.exp(-(0.3**2 + 0.4**2) / 0.25))
+
+
+def test_a_narrower_kernel_is_half_of_the_tracking_rewards_while_standing() -> None:
+    still = state_with(standing=True, base_lin_vel_b=[0.1, 0, 0], base_ang_vel_b=[0, 0, 0.3])
+    ctx = context(standing_kappa=0.02)
+    for term, squared in (("lin_vel_tracking", 0.01), ("ang_vel_tracking", 0.09)):
+        expected = 0.5 * (math.exp(-squared / 0.25) + math.exp(-squared / 0.02))
+        assert value(term, still, ctx) == pytest.approx(expected), term
+    walking = state_with(standing=False, command=[0, 0.2, 0, 0, 0], base_lin_vel_b=[0.1, 0.2, 0])
+    assert value("lin_vel_tracking", walking, context(standing_kappa=0.02)) == pytest.approx(math.exp(-0.01 / 0.25))
 
 
 def test_ang_vel_tracking() -> None:

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
-from eagle_rl.errors import CheckpointError, ConfigError
+from eagle_rl.errors import CheckpointError, ConfigError, EagleWarning
 from eagle_rl.evaluation.evaluate import EvaluationResult
 from eagle_rl.runners.checkpoint import load_checkpoint
 from eagle_rl.runners.claims import Claim, ClaimLostError
 from eagle_rl.runners.records import read_record, stage_dir
 from eagle_rl.runners.stages import run_experiment
-from tests.runners.toy_run import ENVS, STEPS, make_toy_env, parameters, toy_experiment
+from tests.runners.toy_run import ENVS, STEPS, JudgedToyEnv, make_toy_env, parameters, toy_experiment
 
 
 @pytest.fixture(scope="module")
@@ -104,6 +105,27 @@ def test_a_worker_whose_stage_was_taken_over_leaves_it_unrecorded_and_goes_on(tm
     result = run_experiment(toy_experiment(iterations=1, judge_envs=0), tmp_path, make_toy_env)
     assert lost == ["training"]
     assert result.records["round1/distill"].state == "done"
+
+
+def test_a_run_whose_folder_vanishes_goes_on_to_its_end(tmp_path):
+    class Vandal(JudgedToyEnv):
+        steps = 0
+
+        def step(self, actions):
+            self.steps += 1
+            if self.steps == 2 * STEPS + 2:  # in the third iteration, two checkpoints written
+                shutil.rmtree(tmp_path / "run")
+            return super().step(actions)
+
+    with pytest.warns(EagleWarning, match="training goes on") as caught:
+        result = run_experiment(
+            toy_experiment(iterations=5, judge_envs=0, method="ppo"),
+            tmp_path / "run",
+            lambda robots, num_envs, task, seed: Vandal(num_envs, tuple(robots), seed),
+        )
+    assert len(caught) == 1, "once a minute"
+    assert load_checkpoint(result.generalist).manifest["iteration"] == 5
+    assert result.records["generalist"].state == "done"
 
 
 def test_rounds_stop_when_the_score_no_longer_improves(tmp_path):
