@@ -63,26 +63,33 @@ def scaling(num_envs: int, seconds: float) -> list[Figure]:
     return [Figure("environment step, 2 threads / 1 thread", one / two, "x", ">= 1.7", milliseconds(one=one, two=two))]
 
 
+Product = tuple[int, int, int, torch.dtype]
+"""Rows, inner dimension, columns and precision of a matrix product."""
+
+
 class _Products(TorchDispatchMode):
-    """Counts the matrix products that are computed, by their shapes (rows, inner, columns)."""
+    """Counts the matrix products that are computed."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.shapes: Counter[tuple[int, int, int]] = Counter()
+        self.counts: Counter[Product] = Counter()
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         if func in (torch.ops.aten.mm.default, torch.ops.aten.addmm.default):
             a, b = args[-2:]
-            self.shapes[(a.shape[0], a.shape[1], b.shape[1])] += 1
+            self.counts[(a.shape[0], a.shape[1], b.shape[1], a.dtype)] += 1
         return func(*args, **(kwargs or {}))
 
 
 class _Multiplying:
     """The matrix products of an update, and nothing else."""
 
-    def __init__(self, shapes: Counter[tuple[int, int, int]]) -> None:
-        self._work = [(torch.randn(m, k), torch.randn(k, n), count) for (m, k, n), count in shapes.items()]
-        self.flops = sum(2.0 * m * k * n * count for (m, k, n), count in shapes.items())
+    def __init__(self, products: Counter[Product]) -> None:
+        self._work = [
+            (torch.randn(m, k).to(dtype), torch.randn(k, n).to(dtype), count)
+            for (m, k, n, dtype), count in products.items()
+        ]
+        self.flops = sum(2.0 * m * k * n * count for (m, k, n, _), count in products.items())
 
     def multiply(self) -> None:
         for a, b, count in self._work:
@@ -101,7 +108,7 @@ def _products_of_update(runner: EagleRunner) -> _Multiplying:
     runner.alg.update = counting  # type: ignore[method-assign]
     runner.learn(1)
     del runner.alg.update
-    return _Multiplying(counted.shapes)
+    return _Multiplying(counted.counts)
 
 
 def iteration(num_envs: int, threads: int, iterations: int) -> list[Figure]:
