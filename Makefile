@@ -3,8 +3,9 @@
 #   make train     the quickstart experiment: the whole loop on five robots, a tracking table at the end
 #   make play      the published policy, or CKPT=PATH, on five robots side by side
 #   make test      all tests            make check     format, lint, types
-#   make results   tables and figures of docs/results from the published policy (half an hour on two idle cores)
+#   make results   tables and figures of docs/results from the published policy (about 25 minutes on two idle cores)
 #   make bench     throughput           make package   sdist and wheel, installed and tried in an empty folder
+#   make lowest    all tests with the lowest versions setup.py allows, in an environment of its own (.venv-lowest)
 #   make mutants   break the mathematics in 55 places, one at a time: do the tests notice? (about ten minutes)
 #   make clean     remove what was built (never logs/)
 #
@@ -16,6 +17,7 @@ VENV ?= .venv
 CONSTRAINTS ?= -c constraints.txt
 PIP_ARGS ?=
 CKPT ?=
+TEST_ARGS ?=
 RESULT_ENVS ?= 256
 SWEEP_ENVS ?= 32
 
@@ -23,7 +25,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 INSTALLED := $(VENV)/.installed
 
-.PHONY: setup train play test check results bench mutants package clean help
+.PHONY: setup train play test lowest check results bench mutants package clean help
 
 help:
 	@sed -n 's/^# \{0,1\}//p' Makefile
@@ -44,7 +46,13 @@ play: $(INSTALLED)
 	$(BIN)/python play.py $(CKPT)
 
 test: $(INSTALLED)
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest $(TEST_ARGS)
+
+lowest:
+	mkdir -p build
+	sed -n '/install_requires/,/]/s/ *"\([^">]*\)>=\([^",]*\).*/\1==\2/p' setup.py > build/lowest.txt
+	$(MAKE) test VENV=.venv-lowest CONSTRAINTS="-c build/lowest.txt" \
+		TEST_ARGS="-W ignore::DeprecationWarning -W ignore::FutureWarning"  # old packages use what new ones deprecate
 
 check: $(INSTALLED)
 	$(BIN)/ruff check .

@@ -5,7 +5,10 @@ from __future__ import annotations
 
 import sys
 
-from eagle_rl.cli.main import run_verb
+try:
+    from eagle_rl.cli.main import run_verb
+except KeyboardInterrupt:  # so early that nobody listens for it yet
+    sys.exit(130)
 
 if __name__ == "__main__":
     sys.exit(run_verb("play", sys.argv[1:]))

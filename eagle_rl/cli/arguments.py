@@ -8,23 +8,35 @@ from pathlib import Path
 
 from eagle_rl.errors import ConfigError
 
+MAX_COUNT = 1_000_000
+MAX_SECONDS = 1e6
+
 
 def count(text: str) -> int:
     """A whole number above zero; a ``type`` for argparse."""
-    if not text.isdecimal() or int(text) == 0:
+    if not (text.isascii() and text.isdecimal() and int(text) > 0):
         raise argparse.ArgumentTypeError(f"got {text!r}, expected a whole number above 0")
+    if int(text) > MAX_COUNT:
+        raise argparse.ArgumentTypeError(f"got {text!r}, expected at most {MAX_COUNT}")
     return int(text)
 
 
 def seconds(text: str) -> float:
-    """A time of zero or more [s]; a ``type`` for argparse."""
+    """A time from 0 to a million seconds; a ``type`` for argparse."""
     try:
         time = float(text)
     except ValueError:
         time = -1.0
-    if not 0.0 <= time < float("inf"):
-        raise argparse.ArgumentTypeError(f"got {text!r}, expected a time in seconds")
+    if not 0.0 <= time <= MAX_SECONDS:
+        raise argparse.ArgumentTypeError(f"got {text!r}, expected a time in seconds, at most {MAX_SECONDS:g}")
     return time
+
+
+def duration(text: str) -> float:
+    """A time above zero [s]; a ``type`` for argparse."""
+    if seconds(text) == 0.0:
+        raise argparse.ArgumentTypeError(f"got {text!r}, expected a time above zero")
+    return seconds(text)
 
 
 def device(text: str) -> str:

@@ -17,7 +17,7 @@ from eagle_rl.machine import usable_cores
 from eagle_rl.paths import data_root
 from eagle_rl.runners.provenance import versions
 
-from .arguments import count
+from .arguments import count, duration
 
 if TYPE_CHECKING:
     from benchmarks.measure import Figure
@@ -45,8 +45,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("parts", nargs="*", metavar="PART", help=f"what to measure [{' '.join(DEFAULT)}]")
     parser.add_argument("--envs", type=count, default=512, metavar="N", help="environments over all robots [512]")
     parser.add_argument("--threads", type=count, metavar="N", help="physics threads [one a core]")
-    parser.add_argument("--seconds", type=float, default=10.0, metavar="S", help="time for each ratio [10]")
-    parser.add_argument("--minutes", type=float, default=60.0, metavar="M", help="longest time for quality [60]")
+    parser.add_argument("--seconds", type=duration, default=10.0, metavar="S", help="time for each ratio [10]")
+    parser.add_argument("--minutes", type=duration, default=60.0, metavar="M", help="longest time for quality [60]")
     parser.add_argument(
         "--run", type=Path, default=Path("logs/bench_quality"), metavar="DIR", help="quality's folder [%(default)s]"
     )

@@ -101,8 +101,12 @@ def main(argv: Sequence[str]) -> int:
     args = _parser().parse_args(argv)
     if args.out is not None and args.publish is not None:
         raise ConfigError("--out and --publish: --publish names its own ONNX file. Give one of them.")
+    if args.out is not None and (args.out.suffix != ".onnx" or args.out.is_dir()):
+        raise ConfigError(f"--out {args.out}: expected the name of a file that ends in .onnx.")
     if args.out is not None and not args.out.absolute().parent.is_dir():
         raise ConfigError(f"--out {args.out}: there is no folder {args.out.parent}. Make it first.")
+    if args.publish is not None and args.publish.name in ("", ".."):
+        raise ConfigError(f"--publish {args.publish}: expected a name for the files, such as weights/mine.")
 
     from eagle_rl.export.onnx import export_onnx
     from eagle_rl.runners.checkpoint import publish_policy

@@ -16,6 +16,7 @@ from eagle_rl.config.validate import CONTROL_STEP
 from eagle_rl.errors import CheckpointError, ConfigError
 from eagle_rl.paths import data_root
 
+from .arguments import duration
 from .policy import chosen_robots, load_policy
 
 if TYPE_CHECKING:
@@ -53,7 +54,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="SCRIPT",
         help=f"command script, a YAML file or one of {', '.join(known_names('commands'))}",
     )
-    parser.add_argument("--seconds", type=float, metavar="S", help="stop after so long [the script's end]")
+    parser.add_argument("--seconds", type=duration, metavar="S", help="stop after so long [the script's end]")
     parser.add_argument(
         "--replay-fault", type=Path, metavar="FILE.npz", help="show the last states of a sick environment instead"
     )
@@ -96,8 +97,6 @@ def _load(args: argparse.Namespace, checkpoint: Path, seconds: float) -> Session
 def main(argv: Sequence[str]) -> int:
     """Run ``eagle play``."""
     args = _parser().parse_args(argv)
-    if args.seconds is not None and args.seconds <= 0:
-        raise ConfigError(f"--seconds: got {args.seconds:g}, expected a time above zero.")
     files = args.video or args.contact_sheet
     viewer = args.viewer or ("native" if has_display() and not files else "none")
     if viewer == "native" and not has_display():

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 MAX_TILT = 1.0
 """Inclination of the base beyond which the robot counts as fallen [rad]."""
+MAX_SUBSTEPS = 1000
+"""Physics steps per control step."""
 ERRORS = (("E_vx", "m/s"), ("E_vy", "m/s"), ("E_omega", "rad/s"), ("E_h", "m"), ("E_p", "rad"))
 
 
@@ -61,7 +63,7 @@ def main(argv: Sequence[str]) -> int:
     spec = load_robot(args.robot)
     policy = OnnxPolicy(args.policy, spec.name)
     substeps = round(policy.contract.step_dt / args.physics_dt) if args.physics_dt > 0 else 0
-    if substeps < 1 or abs(substeps * args.physics_dt - policy.contract.step_dt) > 1e-9:
+    if not 1 <= substeps <= MAX_SUBSTEPS or abs(substeps * args.physics_dt - policy.contract.step_dt) > 1e-9:
         step = policy.contract.step_dt
         raise ConfigError(f"--physics-dt: got {args.physics_dt:g}, expected a whole fraction of {step:g} s.")
     outcome = simulate(policy, spec, script, substeps)

@@ -89,6 +89,8 @@ def main(argv: Sequence[str]) -> int:
     if args.show:
         print(to_yaml(cfg), end="")
         return 0
+    if args.jobs > len(cfg.robots):
+        raise ConfigError(f"--jobs {args.jobs}: at most one specialist a robot can train at a time: {len(cfg.robots)}.")
     provenance = _provenance(cfg)
     require_device(cfg.run.device)
 

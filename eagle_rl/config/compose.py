@@ -66,6 +66,8 @@ def load_file(kind: str, path: Path, seen: tuple[Path, ...] = ()) -> Node:
         ConfigError: a file is missing or damaged, or bases run in a circle.
     """
     node = read_yaml(path)
+    if kind == "experiment" and not node.children:
+        raise ConfigError(f"{node.where}: holds no experiment. Expected keys, such as `base: ppo`.")
     if path in seen:
         raise ConfigError(f"{node.where}: base files run in a circle: {' -> '.join(p.stem for p in (*seen, path))}.")
     base = node.children.pop("base", None)

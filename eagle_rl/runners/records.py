@@ -83,7 +83,7 @@ def open_plan(
         allow_drift: go on although something has changed.
     """
     path = run_dir / "plan.json"
-    if path.exists():
+    if path.exists() or resume:
         if not resume:
             raise ConfigError(f"{run_dir}: holds a run already. Continue it with --resume, or choose another --out.")
         with _damage_in_words(path):

@@ -99,5 +99,7 @@ def check_writable(path: Path, suffix: str) -> None:
     """
     if path.suffix.lower() != suffix:
         raise ConfigError(f"{path}: expected a name that ends in {suffix}, got {path.suffix!r}.")
+    if path.is_dir():
+        raise ConfigError(f"{path}: is a folder, expected the name of a file.")
     if not path.parent.is_dir():
         raise ConfigError(f"{path}: there is no folder {path.parent}. Make it first.")

@@ -67,17 +67,20 @@ def robot_file(folder: Path, urdf: str) -> Path:
         (["--resume", "."], 5, "not a run directory"),
         (["ppo", "--device", "tpu"], 2, "expected cpu, cuda"),
         (["ppo", "--jobs", "0"], 2, "expected a whole number above 0"),
+        (["ppo", "--jobs", "6"], 2, "--jobs 6: at most one specialist a robot"),
+        (["taken.yaml"], 2, "taken.yaml: holds no experiment"),
     ],
 )
 def test_a_command_typed_into_a_shell_is_refused_within_its_message(tmp_path, words, code, message):
     (tmp_path / "taken").write_text("a file")
+    (tmp_path / "taken.yaml").write_text("# nothing yet")
     command = [sys.executable, str(ROOT / "train.py"), *words]
     done = subprocess.run(command, capture_output=True, text=True, check=False, env=os.environ)
     assert done.returncode == code, done.stderr
     assert message in done.stderr
     assert "Traceback" not in done.stderr
     assert done.stdout == ""
-    assert everything(tmp_path) == {tmp_path / "taken": b"a file"}
+    assert everything(tmp_path) == {tmp_path / "taken": b"a file", tmp_path / "taken.yaml": b"# nothing yet"}
 
 
 def test_every_fault_of_a_file_is_in_one_message(refused):
@@ -133,6 +136,7 @@ def test_where_no_checkpoint_is_it_is_said_so(refused, verb):
     [
         (["evaluate", "--envs", "0"], 2, "--envs: got '0', expected a whole number above 0"),
         (["evaluate", "--steps", "-5"], 2, "--steps: got '-5'"),
+        (["evaluate", "--envs", "10000000"], 2, "--envs: got '10000000', expected at most 1000000"),
         (["evaluate", "--resample", "nan"], 2, "--resample: got 'nan', expected a time"),
         (["evaluate", "--device", "tpu"], 2, "--device: got 'tpu'"),
         (["evaluate", "--robots", "g2"], 3, "Did you mean g1?"),
@@ -140,12 +144,18 @@ def test_where_no_checkpoint_is_it_is_said_so(refused, verb):
         (["plot", "curves", "--out", "taken"], 2, "taken is a file"),
         (["plot", "latents", "--envs", "1.5"], 2, "--envs: got '1.5'"),
         (["export", "--out", "nowhere/p.onnx"], 2, "there is no folder nowhere"),
+        (["export", "--out", "."], 2, "expected the name of a file that ends in .onnx"),
+        (["export", "--publish", "."], 2, "--publish .: expected a name"),
         (["play", "--video", "nowhere/v.mp4"], 2, "there is no folder nowhere"),
+        (["play", "--video", "folder.mp4"], 2, "folder.mp4: is a folder"),
         (["play", "--commands", "taken"], 2, "taken"),
+        (["play", "--seconds", "nan"], 2, "--seconds: got 'nan'"),
+        (["play", "--seconds", "0"], 2, "expected a time above zero"),
     ],
 )
 def test_a_wrong_option_is_named(refused, checkpoint, words, code, message):
     Path("taken").write_text("a file")
+    Path("folder.mp4").mkdir()
     refused([words[0], *words[1:-2], str(checkpoint), *words[-2:]], code, message)
 
 

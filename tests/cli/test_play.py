@@ -57,7 +57,6 @@ def test_without_a_display_and_without_options_the_video_lies_next_to_the_checkp
     ("words", "error", "part"),
     [
         (["--viewer", "native"], ConfigError, "--video"),
-        (["--seconds", "-1"], ConfigError, "--seconds"),
         (["--commands", "dmo"], ConfigError, "demo"),
         (["--robots", "h1,h2"], RobotError, "h2"),
         (["--robots", "h1,h1"], ConfigError, "twice"),

@@ -81,6 +81,12 @@ def test_a_run_is_not_overwritten_without_resume(finished):
         run_experiment(toy_experiment(), finished.run_dir, make_toy_env)
 
 
+def test_a_folder_without_a_plan_cannot_be_resumed(tmp_path):
+    with pytest.raises(CheckpointError, match=r"not a run directory: it has no plan\.json"):
+        run_experiment(toy_experiment(), tmp_path, make_toy_env, resume=True)
+    assert not list(tmp_path.iterdir())
+
+
 def test_resume_with_another_configuration_lists_what_changed(finished):
     with pytest.raises(ConfigError, match=r"plan\.distill_env_steps: 144 -> 7"):
         run_experiment(toy_experiment(distill_env_steps=7), finished.run_dir, make_toy_env, resume=True)
