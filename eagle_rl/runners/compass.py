@@ -143,7 +143,7 @@ class DemonstrationEnv(_Wrapper):
         following, rewards, dones, extras = self._outcome
         final = torch.zeros_like(dones, dtype=torch.bool)  # a row for every environment: a state has one shape
         final[extras["final_ids"]] = True
-        final_observations = torch.zeros_like(following)
+        final_observations = following.clone().zero_()
         final_observations[extras["final_ids"]] = extras["final_observations"]
         return {
             "env": self.env.state_dict(),
