@@ -3,7 +3,7 @@
 #   make train     the quickstart experiment: the whole loop on five robots, a tracking table at the end
 #   make play      the published policy, or CKPT=PATH, on five robots side by side
 #   make test      all tests            make check     format, lint, types
-#   make results   tables and figures of docs/results from the published policy (half an hour on two idle cores)
+#   make results   tables and figures of docs/results from the published policy (about 25 minutes on two idle cores)
 #   make bench     throughput           make package   sdist and wheel, installed and tried in an empty folder
 #   make lowest    all tests with the lowest versions setup.py allows, in an environment of its own (.venv-lowest)
 #   make mutants   break the mathematics in 55 places, one at a time: do the tests notice? (about ten minutes)
@@ -61,7 +61,7 @@ check: $(INSTALLED)
 
 POLICY := checkpoints/generalist
 RESULTS := docs/results
-EVALUATE = $(BIN)/eagle evaluate $(POLICY).safetensors --envs $(RESULT_ENVS)
+EVALUATE = $(BIN)/eagle evaluate "EAGLE + PPO=$(POLICY).safetensors" --envs $(RESULT_ENVS)
 PLOT = $(BIN)/eagle plot
 # Policies whose embeddings are compared: make results LATENTS="with=A without=B"
 LATENTS ?= $(POLICY).safetensors

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import pairwise
 from statistics import median
 from typing import Any
@@ -63,26 +64,33 @@ def scaling(num_envs: int, seconds: float) -> list[Figure]:
     return [Figure("environment step, 2 threads / 1 thread", one / two, "x", ">= 1.7", milliseconds(one=one, two=two))]
 
 
+Product = tuple[int, int, int, torch.dtype]
+"""Rows, inner dimension, columns and precision of a matrix product."""
+
+
 class _Products(TorchDispatchMode):
-    """Counts the matrix products that are computed, by their shapes (rows, inner, columns)."""
+    """Counts the matrix products that are computed."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.shapes: Counter[tuple[int, int, int]] = Counter()
+        self.counts: Counter[Product] = Counter()
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         if func in (torch.ops.aten.mm.default, torch.ops.aten.addmm.default):
             a, b = args[-2:]
-            self.shapes[(a.shape[0], a.shape[1], b.shape[1])] += 1
+            self.counts[(a.shape[0], a.shape[1], b.shape[1], a.dtype)] += 1
         return func(*args, **(kwargs or {}))
 
 
 class _Multiplying:
     """The matrix products of an update, and nothing else."""
 
-    def __init__(self, shapes: Counter[tuple[int, int, int]]) -> None:
-        self._work = [(torch.randn(m, k), torch.randn(k, n), count) for (m, k, n), count in shapes.items()]
-        self.flops = sum(2.0 * m * k * n * count for (m, k, n), count in shapes.items())
+    def __init__(self, products: Counter[Product]) -> None:
+        self._work = [
+            (torch.randn(m, k).to(dtype), torch.randn(k, n).to(dtype), count)
+            for (m, k, n, dtype), count in products.items()
+        ]
+        self.flops = sum(2.0 * m * k * n * count for (m, k, n, _), count in products.items())
 
     def multiply(self) -> None:
         for a, b, count in self._work:
@@ -101,7 +109,7 @@ def _products_of_update(runner: EagleRunner) -> _Multiplying:
     runner.alg.update = counting  # type: ignore[method-assign]
     runner.learn(1)
     del runner.alg.update
-    return _Multiplying(counted.shapes)
+    return _Multiplying(counted.counts)
 
 
 def iteration(num_envs: int, threads: int, iterations: int) -> list[Figure]:
@@ -110,7 +118,7 @@ def iteration(num_envs: int, threads: int, iterations: int) -> list[Figure]:
     env = make_env(cfg, num_envs)
     runner, bare = make_runner(cfg, env), BarePhysics(env)
     products = _products_of_update(runner)
-    budget, books = Budget(), []
+    budget, wall, cpu = Budget(), [], []
     for owner, method, section in ((EaglePPO, "update", "update"), (bare, "step", "bare")):
         budget.watch(owner, method, section, whole=True)
     budget.watch(products, "multiply", "products")
@@ -119,13 +127,24 @@ def iteration(num_envs: int, threads: int, iterations: int) -> list[Figure]:
         for _ in range(cfg.algo.num_steps_per_env):
             bare.step()
         products.multiply()
-        books.append(dict(budget.wall))
+        wall.append(dict(budget.wall))
+        cpu.append(dict(budget.cpu))
 
     with budget:
         runner.learn(iterations + 1, on_iteration=turn)
+    env_steps = cfg.algo.num_steps_per_env * num_envs
+    worked = _medians(cpu)
+    saved = worked["bare"] * (1.0 - 1.0 / threads)  # by threads that have a core each
+    ideal = worked | {"bare": worked["bare"] - saved, "other": worked["other"] - saved}
+    figures = _iteration_figures(num_envs, env_steps, ideal, products.flops)[:3]
+    figures = [replace(figure, name=f"{figure.name}, from CPU time") for figure in figures]
+    return _iteration_figures(num_envs, env_steps, _medians(wall), products.flops) + figures
+
+
+def _medians(books: list[dict[str, float]]) -> dict[str, float]:
+    """Median of what each section gained from one entry to the next."""
     rounds = [{name: after[name] - before[name] for name in after} for before, after in pairwise(books)]
-    times = {name: median(r[name] for r in rounds) for name in ("other", "update", "bare", "products")}
-    return _iteration_figures(num_envs, cfg.algo.num_steps_per_env * num_envs, times, products.flops)
+    return {name: median(r[name] for r in rounds) for name in ("other", "update", "bare", "products")}
 
 
 def _iteration_figures(num_envs: int, env_steps: int, times: dict[str, float], flops: float) -> list[Figure]:

@@ -29,6 +29,12 @@ METHODS = {
     "eagle_id": "EAGLE w/ ID",
     "single": "single-robot PPO",
     "published": "PPO",
+    "fork_ppo": "PPO continued",
+    "fork_compass": "COMPASS",
+    "fork_kickstarting": "Kickstarting",
+    "fork_eagle": "EAGLE",
+    "fork_eagle_id": "EAGLE w/ ID",
+    "finish": "PPO continued",
 }
 """The paper's name for each of its experiments."""
 

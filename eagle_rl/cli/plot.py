@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,6 +18,7 @@ from .policy import Policy, chosen_robots, load_policy
 
 if TYPE_CHECKING:
     from eagle_rl.evaluation.estimator import Channel
+    from eagle_rl.evaluation.metrics import RobotMetrics
     from eagle_rl.evaluation.plots import Figure
     from eagle_rl.evaluation.robustness import Sweep
 
@@ -114,7 +115,7 @@ def _policies(args: argparse.Namespace) -> Iterator[tuple[str, Policy, tuple[str
 
 
 def _protocol(args: argparse.Namespace, cfg: ExperimentCfg) -> EvaluationCfg:
-    return dataclasses.replace(cfg.evaluation, num_envs_per_robot=args.envs, num_steps=args.steps)
+    return replace(cfg.evaluation, num_envs_per_robot=args.envs, num_steps=args.steps)
 
 
 def _latents(args: argparse.Namespace) -> dict[str, Figure]:
@@ -127,7 +128,8 @@ def _latents(args: argparse.Namespace) -> dict[str, Figure]:
         found = latents.collect_embeddings(policy.actor, make_env, robots, cfg.task, cfg.evaluation, num_envs=args.envs)
         scores = latents.silhouette(found), latents.probe_accuracy(found)
         maps[name] = (found, latents.tsne(found), *scores)
-        numbers[name] = dict(zip(("silhouette", "linear_probe_accuracy"), scores, strict=True))
+        measured = dict(zip(("silhouette", "linear_probe_accuracy"), scores, strict=True))
+        numbers[name] = _provenance(policy, replace(cfg.evaluation, num_envs_per_robot=args.envs)) | measured
     _write_numbers(args.out / "latents.json", numbers)
     return {"": plots.latent_maps(maps)}
 
@@ -170,11 +172,21 @@ def _swept(args: argparse.Namespace, sweeps: Mapping[str, Sweep]) -> dict[str, F
         }
         figures[name] = plots.robustness((sweeps[kind], scores[kind]) for kind in sweeps)
         plain = {
-            kind: {str(v): {r: dataclasses.asdict(m) for r, m in scored.items()} for v, scored in by_value.items()}
+            kind: {str(value): {robot: _brief(m) for robot, m in scored.items()} for value, scored in by_value.items()}
             for kind, by_value in scores.items()
         }
-        _write_numbers(args.out / f"{args.figure}_{name}.json", plain)
+        _write_numbers(args.out / f"{args.figure}_{name}.json", _provenance(policy, ev) | plain)
     return figures
+
+
+def _brief(metrics: RobotMetrics) -> dict[str, object]:
+    """Scores over all steps."""
+    return {"survival": metrics.survival, "upright": metrics.upright} | asdict(metrics.subsets["all"])
+
+
+def _provenance(policy: Policy, ev: EvaluationCfg) -> dict[str, object]:
+    """What has to be known to repeat the numbers of a figure."""
+    return {"checkpoint": policy.sha256, "protocol": asdict(ev)}
 
 
 def _estimator(args: argparse.Namespace) -> dict[str, Figure]:
@@ -192,8 +204,7 @@ def _estimator(args: argparse.Namespace) -> dict[str, Figure]:
         print(table)
         _write(args.out / f"estimator_{name}.md", table)
         _write(args.out / f"estimator_{name}.csv", to_csv(report))
-        protocol = {"checkpoint": policy.sha256, "protocol": dataclasses.asdict(ev)}
-        _write_numbers(args.out / f"estimator_{name}.json", protocol | dataclasses.asdict(report))
+        _write_numbers(args.out / f"estimator_{name}.json", _provenance(policy, ev) | asdict(report))
     return figures
 
 

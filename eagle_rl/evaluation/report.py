@@ -78,15 +78,14 @@ def _over_seeds(values: Sequence[float | None], paper: float | None = None) -> C
 _DRAWN = {
     "single": "one command drawn, the others zero",
     "joint": "all five commands drawn",
-    "standing": "velocities exactly zero, so that their errors are drift, height and pitch drawn",
+    "standing": "velocities exactly zero, height and pitch drawn",
 }
 
 
 def describe(ev: EvaluationCfg, subset: str, falls: Falls) -> str:
     """The protocol in words."""
-    drawn = _DRAWN[ev.protocol]
-    if ev.protocol == "standing" and num_draws(ev) > 1:
-        drawn += " in every second draw, all five drawn in the others"
+    by_turns = ev.protocol == "standing" and num_draws(ev) > 1
+    drawn = "velocities exactly zero in every second draw, all else drawn" if by_turns else _DRAWN[ev.protocol]
     held = f"redrawn every {ev.resampling_time_s:g} s" if ev.resampling_time_s > 0 else "kept for the episode"
     dynamics = "randomized dynamics and pushes" if ev.randomization else "nominal dynamics"
     after = "steps after a fall are charged |c_d|" if falls == "charged" else "steps after a fall are left out"

@@ -79,12 +79,12 @@ BODIES: Mapping[str, Sweep] = {
         apply=lambda v: replace(NOMINAL, morphology_mass_scale=(v, v)),
     ),
     "build": Sweep(
-        label="size and mass of each body, drawn within ± [-]",
+        label="size and mass of a body, within ± [-]",
         values=(0.0, 0.1, 0.2, 0.3, 0.4),
         apply=lambda v: replace(NOMINAL, morphology_length_scale=_around(v), morphology_mass_scale=_around(v)),
     ),
     "proportions": Sweep(
-        label="mass of each link by itself, drawn within ± [-]",
+        label="mass of each link, within ± [-]",
         values=(0.0, 0.2, 0.4, 0.6, 0.8),
         apply=lambda v: replace(NOMINAL, link_mass_scale=_around(v)),
     ),

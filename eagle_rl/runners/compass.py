@@ -141,6 +141,10 @@ class DemonstrationEnv(_Wrapper):
     def state_dict(self) -> dict[str, Any]:
         """The environment's state, and the step it is ahead."""
         following, rewards, dones, extras = self._outcome
+        final = torch.zeros_like(dones, dtype=torch.bool)  # a row for every environment: a state has one shape
+        final[extras["final_ids"]] = True
+        final_observations = following.clone().zero_()
+        final_observations[extras["final_ids"]] = extras["final_observations"]
         return {
             "env": self.env.state_dict(),
             "obs": self._obs.to_dict(),
@@ -148,8 +152,8 @@ class DemonstrationEnv(_Wrapper):
             "rewards": rewards,
             "dones": dones,
             "time_outs": extras["time_outs"],
-            "final_ids": extras["final_ids"],
-            "final_observations": extras["final_observations"].to_dict(),
+            "final": final,
+            "final_observations": final_observations.to_dict(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -160,10 +164,11 @@ class DemonstrationEnv(_Wrapper):
             return TensorDict(state[name], batch_size=[size], device=self._obs.device)
 
         self._obs = observations("obs", self.env.num_envs)
+        ids = state["final"].nonzero().squeeze(1)
         extras = {
             "time_outs": state["time_outs"],
-            "final_ids": state["final_ids"],
-            "final_observations": observations("final_observations", len(state["final_ids"])),
+            "final_ids": ids,
+            "final_observations": observations("final_observations", self.env.num_envs)[ids],
             "log": {},
         }
         self._outcome = (observations("following", self.env.num_envs), state["rewards"], state["dones"], extras)

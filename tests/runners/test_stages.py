@@ -127,7 +127,7 @@ def test_a_run_whose_folder_vanishes_goes_on_to_its_end(tmp_path):
         result = run_experiment(
             toy_experiment(iterations=5, judge_envs=0, method="ppo"),
             tmp_path / "run",
-            lambda robots, num_envs, task, seed: Vandal(num_envs, tuple(robots), seed),
+            lambda robots, num_envs, task, seed, first=0: Vandal(num_envs, tuple(robots), seed),
         )
     assert len(caught) == 1, "once a minute"
     assert load_checkpoint(result.generalist).manifest["iteration"] == 5

@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from eagle_rl.cli.status import main, status_tree
-from eagle_rl.errors import ConfigError
+from eagle_rl.errors import CheckpointError
 from eagle_rl.runners.claims import Claim
 from eagle_rl.runners.plan import plan_stages
 from eagle_rl.runners.provenance import Provenance
@@ -74,5 +74,5 @@ def test_the_tree_names_every_stage_once_under_its_round(run_dir):
 
 
 def test_a_folder_without_a_run_is_refused(tmp_path):
-    with pytest.raises(ConfigError, match=r"no plan\.json"):
+    with pytest.raises(CheckpointError, match=r"no plan\.json"):
         main([str(tmp_path)])
