@@ -61,15 +61,17 @@ assert_same_as_a_run_that_had_room()
 """
 
 BECOMES_FREE = """
-tries = []
-def sleep(seconds):
+tries, nap = [], files.time.sleep
+def sleep(seconds):  # everybody's, since modules share it
+    if seconds != files.RETRY_S:
+        return nap(seconds)
     tries.append(seconds)
     if len(tries) == 3:
         filler.unlink()
 files.time.sleep = sleep
 fill(5 * 150_000 // 2)
 assert start() == 0
-assert len(tries) == 3 and set(tries) == {files.RETRY_S}
+assert len(tries) == 3
 assert_same_as_a_run_that_had_room()
 """
 
