@@ -34,6 +34,7 @@ from .mdp.observations import (
     proprioception,
     scan_points,
 )
+from .mdp.posture import make_posture
 from .mdp.randomization import Randomizer
 from .mdp.rewards import RewardContext, compute_rewards, success_scores
 from .mdp.terminations import terminations
@@ -119,6 +120,7 @@ class HumanoidEnv(VecEnv):
         observations = task.observations
         points = scan_points(observations).to(self.device, dtype)
         robot_id = self.robots.robot_id
+        self.posture = make_posture(task.control, robots, self.robots.default_joint_pos, robot_id, self.step_dt)
         self.ground = make_ground(terrain, points, robot_id, self.rng, self.step_dt, self.max_episode_length)
         self.embodiment = (
             pooled_embodiment(robots, robot_id, self.randomizer.bodies, observations.descriptor)
@@ -252,7 +254,7 @@ class HumanoidEnv(VecEnv):
         sound = actions.abs() <= MAX_ACTION
         self._last_last_actions, self._last_actions = self._last_actions, self._actions
         self._actions = torch.where(live & sound, actions.to(self._actions.dtype).clamp(-clip, clip), 0.0)
-        targets = self.robots.default_joint_pos + self.robots.action_scale * self._actions
+        targets = self.posture.advance(self.command) + self.robots.action_scale * self._actions
         absurd = (live & ~sound).any(dim=1, keepdim=True)
         return (targets + self.randomizer.motor_offset).masked_fill(absurd, torch.nan)
 
@@ -325,6 +327,7 @@ class HumanoidEnv(VecEnv):
         self.episode_length_buf = self.episode_length_buf.index_fill(0, ids, 0)
         self.phase = self.phase.index_fill(0, ids, 0.0)
         self.commands.renew(ids, fallen)
+        self.posture.reset(ids)
         for name in ("_actions", "_last_actions", "_last_last_actions", "_last_contact"):
             setattr(self, name, getattr(self, name).index_fill(0, ids, 0))
         self._last_joint_vel = self._last_joint_vel.index_copy(0, ids, staged[:, self.pool.columns["joint_vel"]])
@@ -365,7 +368,7 @@ class HumanoidEnv(VecEnv):
         "_last_contact _last_frame"
     ).split()
 
-    _PARTS = ("randomizer", "pool", "commands", "ground", "aids", "step_log")
+    _PARTS = ("randomizer", "pool", "commands", "posture", "ground", "aids", "step_log")
     """What has a state of its own; randomization first, because the physics is recomputed under it."""
 
     def state_dict(self) -> dict[str, Any]:

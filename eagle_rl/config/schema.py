@@ -68,6 +68,11 @@ class ControlCfg:
     waist_ratio: float = 0.5
     """Extra factor at the waist [-] (ours: the noise of a stiff waist shakes a light pelvis; at 0.5 it makes up half of
     the yaw-rate error H1 has in training)."""
+    posture_reference: bool = False
+    """Whether the targets' resting pose bends to the commanded height and pitch, so that the policy need not learn the
+    kinematics of a squat (ours)."""
+    posture_time_constant: float = 0.25
+    """Lag with which that pose follows the command [s] (ours)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -235,6 +240,9 @@ class RewardsCfg:
     standing_kappa: float = 0.25
     """kappa of a second kernel that makes up half of both terms while all velocity commands are zero. Narrower than the
     first, it rewards standing still at once; drifting at 0.1 m/s costs the first 4 % and ends in a fall (ours)."""
+    walking_kappa: float = 0.25
+    """The same while any velocity is commanded: the first kernel draws a robot near its command, the second goes on
+    paying for the last tenths (ours)."""
     contact_vel_kappa: float = 5.0
     """[m^2/s^2] (paper)."""
     contact_force_kappa: float = 50.0

@@ -30,10 +30,11 @@ BOUNDS: dict[str, _Bound] = dict.fromkeys(
     num_envs task.sim.physics_dt task.sim.decimation task.sim.solver_iterations task.sim.solver_ls_iterations
     task.terrain.num_levels task.terrain.patch_size task.terrain.cell_size
     task.control.action_scale task.control.action_clip task.control.hip_yaw_ratio
+    task.control.posture_time_constant
     task.commands.resampling_time_s task.commands.curriculum.num_bins_lin_vel_x
     task.commands.curriculum.num_bins_ang_vel_z task.gait.frequency task.gait.contact_smoothing
     task.observations.history_length task.observations.clip
-    task.rewards.tracking_kappa task.rewards.standing_kappa task.rewards.contact_vel_kappa
+    task.rewards.tracking_kappa task.rewards.standing_kappa task.rewards.walking_kappa task.rewards.contact_vel_kappa
     task.rewards.contact_force_kappa task.rewards.foot_slip_kappa
     task.rewards.foot_swing_clip task.rewards.penalty_interval_steps
     task.terminations.episode_length_s task.terminations.max_roll task.terminations.max_pitch

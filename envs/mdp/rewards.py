@@ -68,21 +68,32 @@ def _square_sum(x: Tensor) -> Tensor:
 
 
 def _tracking(squared_error: Tensor, state: PooledState, cfg: RewardsCfg) -> Tensor:
-    """``rho`` of a velocity's error; while standing the mean of that and of a narrower ``rho``, see the schema."""
+    """Mean of ``rho`` of a velocity's error and of a narrower ``rho``, one for standing, one for walking (schema)."""
     wide = _rho(squared_error, cfg.tracking_kappa)
-    if cfg.standing_kappa == cfg.tracking_kappa:
+    if cfg.standing_kappa == cfg.walking_kappa == cfg.tracking_kappa:
         return wide
-    return torch.where(state.standing, 0.5 * (wide + _rho(squared_error, cfg.standing_kappa)), wide)
+    kappa = torch.where(state.standing, cfg.standing_kappa, cfg.walking_kappa).to(squared_error.dtype)
+    return 0.5 * (wide + torch.exp(squared_error / -kappa))
+
+
+def _lin_vel_error(state: PooledState, robots: PooledRobots, ctx: RewardContext) -> Tensor:
+    """``|v_xy* - v_xy|^2`` in the base frame [m^2/s^2]."""
+    return _square_sum(state.command[:, :2] - state.base_lin_vel_b[:, :2])
+
+
+def _ang_vel_error(state: PooledState, robots: PooledRobots, ctx: RewardContext) -> Tensor:
+    """``(omega_z* - omega_z)^2`` in the base frame [rad^2/s^2]."""
+    return (state.command[:, 2] - state.base_ang_vel_b[:, 2]).square()
 
 
 def lin_vel_tracking(state: PooledState, robots: PooledRobots, ctx: RewardContext) -> Tensor:
     """``rho(|v_xy* - v_xy|^2)`` in the base frame [-], a reward (Lin. vel. tracking)."""
-    return _tracking(_square_sum(state.command[:, :2] - state.base_lin_vel_b[:, :2]), state, ctx.cfg)
+    return _tracking(ctx.once(_lin_vel_error, state, robots), state, ctx.cfg)
 
 
 def ang_vel_tracking(state: PooledState, robots: PooledRobots, ctx: RewardContext) -> Tensor:
     """``rho((omega_z* - omega_z)^2)`` in the base frame [-], a reward (Ang. vel. tracking)."""
-    return _tracking((state.command[:, 2] - state.base_ang_vel_b[:, 2]).square(), state, ctx.cfg)
+    return _tracking(ctx.once(_ang_vel_error, state, robots), state, ctx.cfg)
 
 
 def base_height(state: PooledState, robots: PooledRobots, ctx: RewardContext) -> Tensor:
@@ -295,11 +306,11 @@ def success_scores(
     """The four quantities that judge a command window, each 1 at best, shape (N,) (HugWBC 2).
 
     Linear and angular velocity tracking, then 1 minus the mean over the feet of contact force and contact velocity
-    errors; all by the table's kernels, whatever the gait shaping.
+    errors; all by the table's kernels, whatever the gait shaping or narrower kernels.
     """
     return (
-        ctx.once(lin_vel_tracking, state, robots),
-        ctx.once(ang_vel_tracking, state, robots),
+        _rho(ctx.once(_lin_vel_error, state, robots), ctx.cfg.tracking_kappa),
+        _rho(ctx.once(_ang_vel_error, state, robots), ctx.cfg.tracking_kappa),
         1.0 - 0.5 * _swing_load(state, robots, ctx, ctx.cfg.contact_force_kappa),
         1.0 - 0.5 * ctx.once(contact_vel, state, robots),
     )

@@ -1,0 +1,103 @@
+"""The pose a robot rests in at a commanded height and pitch: legs bent so that feet stay flat and balance is kept."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pinocchio
+
+from .embodiment import pinocchio_model
+from .slots import SLOT_INDEX
+from .spec import FEET, Array, RobotSpec
+
+HEIGHTS = tuple(np.linspace(-0.3, 0.0, 7).tolist())
+PITCHES = tuple(np.linspace(-0.3, 0.5, 9).tolist())
+"""Nodes of :func:`posture_table`: height offset [m] and pitch [rad], the finishing ranges of the paper's commands."""
+
+LEG_JOINTS = ("hip_pitch", "knee_pitch", "ankle_pitch")
+"""What bends, the same on both legs."""
+POSTURE_SLOTS = tuple(tuple(SLOT_INDEX[f"{side}_{joint}"] for joint in LEG_JOINTS) for side in FEET)
+"""Slots of those joints, (2, 3)."""
+
+_WEIGHTS = np.array([0.3, 1.0, 1.0])
+"""What a radian of tilt weighs against a metre, where limits forbid having all."""
+_ITERATIONS = 40
+_STEP = 1e-6
+"""Of the finite differences [rad]."""
+_TOLERANCE = 1e-8
+
+
+@cache
+def posture_table(spec: RobotSpec) -> Array:
+    """Canonical offsets from the default pose at every node, shape (heights, pitches, 3) [rad].
+
+    At each node the base is at the commanded height and pitch, both soles are as flat as in the default pose and the
+    centre of mass is as far ahead of them. Where joint limits forbid it, the nearest pose they allow.
+    """
+    legs = _Legs(spec)
+    table = np.zeros((len(HEIGHTS), len(PITCHES), len(LEG_JOINTS)))
+    upright = int(np.argmin(np.abs(PITCHES)))
+    for row in reversed(range(len(HEIGHTS))):  # from the default pose outwards, each from its neighbour's solution
+        start = table[min(row + 1, len(HEIGHTS) - 1), upright]
+        for columns in (range(upright, len(PITCHES)), range(upright, -1, -1)):
+            bend = start
+            for column in columns:
+                bend = table[row, column] = legs.solve(HEIGHTS[row], PITCHES[column], bend)
+    return table
+
+
+class _Legs:
+    """Kinematics of a robot whose legs bend together."""
+
+    def __init__(self, spec: RobotSpec) -> None:
+        self._model = pinocchio_model(spec)
+        self._data = self._model.createData()
+        self._spec = spec
+        joints = spec.slots.tolist()
+        self._index = np.array([[joints.index(slot) for slot in side] for side in POSTURE_SLOTS])
+        self._columns = np.array([self._model.joints[self._model.getJointId(n)].idx_q for n in spec.joint_names])
+        self._feet = [
+            self._model.getFrameId(spec.link_roles[f"{side}_foot"], pinocchio.FrameType.BODY) for side in FEET
+        ]
+        signs, centre = spec.signs[self._index[0]], spec.default_joint_pos[self._index[0]]
+        ends = signs * (np.stack([spec.joint_lower, spec.joint_upper])[:, self._index[0]] - centre)
+        self._lower, self._upper = ends.min(axis=0), ends.max(axis=0)
+        self._rest = self.measure(0.0, np.zeros(3))
+
+    def measure(self, pitch: float, bend: Array) -> Array:
+        """Tilt of the soles [rad], height of the base above them and centre of mass ahead of them [m], shape (3,)."""
+        joints = self._spec.default_joint_pos.copy()
+        joints[self._index] += self._spec.signs[self._index] * bend
+        q = pinocchio.neutral(self._model)
+        q[3:7] = (0.0, np.sin(pitch / 2), 0.0, np.cos(pitch / 2))
+        q[self._columns] = joints
+        pinocchio.framesForwardKinematics(self._model, self._data, q)
+        centre = pinocchio.centerOfMass(self._model, self._data, q)
+        poses = [self._data.oMf[foot] for foot in self._feet]
+        soles = [pose.act(sole) for pose, sole in zip(poses, self._spec.sole_offsets, strict=True)]
+        tilt = np.mean([np.arctan2(-pose.rotation[2, 0], pose.rotation[0, 0]) for pose in poses])
+        ahead, height = centre[0] - np.mean([s[0] for s in soles]), -np.mean([s[2] for s in soles])
+        return np.array([tilt, height, ahead])
+
+    def solve(self, height: float, pitch: float, start: Array) -> Array:
+        """Canonical offsets (3,) for a height offset [m] and a pitch [rad]: Levenberg-Marquardt inside the limits."""
+        wanted = self._rest + np.array([0.0, height, 0.0])
+        bend, damping = start, 1e-3
+        missing = _WEIGHTS * (wanted - self.measure(pitch, bend))
+        for _ in range(_ITERATIONS):
+            if np.abs(missing).max() < _TOLERANCE:
+                break
+            moved = np.stack([self.measure(pitch, bend + d) for d in _STEP * np.eye(3)], axis=1)
+            jacobian = (_WEIGHTS[:, None] * (wanted[:, None] - moved) - missing[:, None]) / -_STEP
+            downhill = jacobian.T @ missing
+            held = ((bend <= self._lower) & (downhill < 0)) | ((bend >= self._upper) & (downhill > 0))
+            jacobian, downhill = np.where(held, 0.0, jacobian), np.where(held, 0.0, downhill)
+            step = np.linalg.solve(jacobian.T @ jacobian + damping * np.eye(3), downhill)
+            trial = np.clip(bend + step, self._lower, self._upper)
+            left = _WEIGHTS * (wanted - self.measure(pitch, trial))
+            if left @ left < missing @ missing:
+                bend, missing, damping = trial, left, damping * 0.1
+            else:
+                damping *= 10.0
+        return bend
