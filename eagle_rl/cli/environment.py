@@ -19,7 +19,7 @@ def make_env_factory(run: RunCfg) -> MakeEnv:
     """The function by which runners build environments without knowing the simulation; it can be pickled.
 
     Args:
-        run: device of the tensors and number of physics threads.
+        run: device of the environments' tensors and number of physics threads.
     """
     return partial(_make_env, run)
 
@@ -32,4 +32,4 @@ def _make_env(
 
     specs = [load_robot(name) for name in robots]
     threads = run.num_threads or own_cores()
-    return HumanoidEnv(task, specs, num_envs, seed, device=run.device, num_threads=threads, first_env=first_env)
+    return HumanoidEnv(task, specs, num_envs, seed, device=run.env_device, num_threads=threads, first_env=first_env)

@@ -13,8 +13,8 @@ from eagle_rl.errors import ConfigError
 from .policy import load_policy
 
 if TYPE_CHECKING:
-    from eagle_rl.config.schema import ExperimentCfg
-    from eagle_rl.export.contract import Contract, RobotContract, Term
+    from eagle_rl.config.schema import ExperimentCfg, TaskCfg
+    from eagle_rl.export.contract import Contract, Posture, RobotContract, Term
     from envs.mdp.layout import ObservationTerm
     from envs.robots.spec import Array, RobotSpec
 
@@ -65,6 +65,7 @@ def build_contract(cfg: ExperimentCfg, checkpoint: str, robots: Sequence[str]) -
         gait_frequency=task.gait.frequency,
         gait_phase_offset=task.gait.phase_offset,
         standing_phase=STANDING_PHASE,
+        posture=_posture(cfg.task) if task.control.posture_reference else None,
         robots={spec.name: _robot(spec, cfg) for spec in map(load_robot, robots)},
     )
 
@@ -75,9 +76,19 @@ def _term(term: ObservationTerm) -> Term:
     return Term(name=term.name, unit=term.unit, scale=term.scales)
 
 
+def _posture(task: TaskCfg) -> Posture:
+    from eagle_rl.export.contract import Posture
+    from envs.mdp.posture import left_over
+    from envs.robots.posture import HEIGHTS, PITCHES
+
+    step_dt = task.sim.physics_dt * task.sim.decimation
+    return Posture(heights=HEIGHTS, pitches=PITCHES, left_over=left_over(task.control, step_dt))
+
+
 def _robot(spec: RobotSpec, cfg: ExperimentCfg) -> RobotContract:
     from eagle_rl.export.contract import RobotContract
     from envs.pooling import action_scale
+    from envs.robots.posture import joint_offsets
 
     def numbers(values: Array) -> tuple[float, ...]:
         return tuple(values.tolist())
@@ -93,6 +104,7 @@ def _robot(spec: RobotSpec, cfg: ExperimentCfg) -> RobotContract:
         damping=numbers(spec.damping),
         effort_limit=numbers(spec.effort_limit),
         nominal_height=spec.nominal_height,
+        posture_offsets=numbers(joint_offsets(spec).ravel()) if cfg.task.control.posture_reference else (),
     )
 
 

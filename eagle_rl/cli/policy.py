@@ -52,7 +52,7 @@ def load_policy(path: Path, device: str = "cpu") -> Policy:
     actor, manifest = load_actor(checkpoint, device, slot_table_hash(SLOT_NAMES))
     cfg = experiment_from_plain(manifest["config"], str(checkpoint))
     set_up_torch(1)  # a forward pass is little beside the physics, and waiting threads take the cores from it
-    cfg = dataclasses.replace(cfg, run=dataclasses.replace(cfg.run, device=device))
+    cfg = dataclasses.replace(cfg, run=dataclasses.replace(cfg.run, device=device, env_device=device))
     env_steps = manifest["env_steps"] if checkpoint.suffix == SUFFIX else training_steps(checkpoint)
     return Policy(checkpoint, actor, cfg, manifest["sha256"], env_steps)
 

@@ -92,7 +92,8 @@ def main(argv: Sequence[str]) -> int:
     if args.jobs > len(cfg.robots):
         raise ConfigError(f"--jobs {args.jobs}: at most one specialist a robot can train at a time: {len(cfg.robots)}.")
     provenance = _provenance(cfg)
-    require_device(cfg.run.device)
+    for device in (cfg.run.device, cfg.run.env_device):
+        require_device(device)
 
     from eagle_rl.runners.team import Team
 

@@ -466,6 +466,10 @@ class RunCfg:
     """Bookkeeping of a run."""
 
     device: str = "cpu"
+    """Of the learner: ``cpu``, ``cuda`` or ``cuda:N``."""
+    env_device: str = "cpu"
+    """Of observations, rewards and commands in training. They are many small steps, which a core beside the physics
+    takes in the time a GPU needs to be asked for them (docs/performance.md)."""
     num_threads: int = 0
     """Physics threads; 0 takes every core, under torchrun its process's share of them."""
     torch_threads: int = 1

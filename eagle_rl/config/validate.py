@@ -213,8 +213,9 @@ def _plan_faults(cfg: ExperimentCfg) -> Iterator[Fault]:
         for key in ("specialist_env_steps", "distill_env_steps", *own):
             if getattr(cfg.plan, key) == 0:
                 yield f"plan.{key}", f"0, but method {cfg.plan.method} needs a budget for this stage"
-    if not re.fullmatch(r"cpu|cuda(:\d+)?", cfg.run.device):
-        yield "run.device", f"got {cfg.run.device!r}, expected cpu, cuda or cuda:N"
+    for key in ("device", "env_device"):
+        if not re.fullmatch(r"cpu|cuda(:\d+)?", getattr(cfg.run, key)):
+            yield f"run.{key}", f"got {getattr(cfg.run, key)!r}, expected cpu, cuda or cuda:N"
     if not re.fullmatch(r"\w[\w.-]*", cfg.name):
         yield "name", f"got {cfg.name!r}, expected letters, digits, - and _: it names the run's folder"
 

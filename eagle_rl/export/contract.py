@@ -8,7 +8,9 @@ Canonical angles are ``sign * (q - zero_offset)``; slot arrays hold zero where a
    the right foot; the right foot's phase starts at 0 and gains ``gait_frequency * step_dt`` a step, the left one is
    ahead by ``gait_phase_offset``; both are ``standing_phase`` while the three velocity commands are zero.
 4. ``slot_mask``: 1 in the robot's slots.
-5. PD targets: default angle + ``action_scale`` * action, both canonical; actions bounded by ``action_clip``.
+5. PD targets: resting pose + ``action_scale`` * action, both canonical; actions bounded by ``action_clip``. The resting
+   pose is the default one or, where there is a ``posture``, that plus offsets interpolated linearly between its nodes
+   at a height and pitch that follow the command: each step ``1 - posture.left_over`` of the way, from zero at the start.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ from typing import Any
 
 from eagle_rl.errors import CheckpointError
 
-FORMAT = 1
+FORMAT = 2
 METADATA_KEY = "eagle.contract"
 """Entry of the ONNX file's metadata that holds the contract."""
 DIGEST_KEY = "eagle.contract.sha256"
@@ -57,6 +59,20 @@ class RobotContract:
     """Bound on kp * error [N m]."""
     nominal_height: float
     """Base height at height command zero [m]."""
+    posture_offsets: Numbers = ()
+    """Canonical offsets [rad] at the nodes of ``posture``: height, pitch, joint, the last changing fastest."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Posture:
+    """How the resting pose follows the commanded height and pitch."""
+
+    heights: Numbers
+    """Nodes, evenly spaced [m]."""
+    pitches: Numbers
+    """Nodes, evenly spaced [rad]."""
+    left_over: float
+    """Share of the way to the command that is left after a control step [-]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,6 +98,8 @@ class Contract:
     """[cycles]"""
     standing_phase: float
     """[cycles]"""
+    posture: Posture | None
+    """None where the resting pose is the default pose."""
     robots: dict[str, RobotContract]
 
     def to_json(self) -> str:
@@ -112,7 +130,9 @@ class Contract:
             robots = {name: RobotContract(**_tuples(robot)) for name, robot in values.pop("robots").items()}
             frame = tuple(Term(**_tuples(term)) for term in values.pop("frame"))
             command = Term(**_tuples(values.pop("command")))
-            return cls(robots=robots, frame=frame, command=command, **_tuples(values))
+            nodes = values.pop("posture")
+            posture = None if nodes is None else Posture(**_tuples(nodes))
+            return cls(robots=robots, frame=frame, command=command, posture=posture, **_tuples(values))
         except CheckpointError:
             raise
         except (ValueError, KeyError, TypeError, AttributeError) as error:

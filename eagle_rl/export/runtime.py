@@ -81,8 +81,14 @@ class OnnxPolicy:
         self._slots = np.array(self.robot.slots)
         self._mask = np.zeros(len(self.contract.slots))
         self._mask[self._slots] = 1.0
-        self._signs, self._default, self._action_scale = (
-            np.array(x) for x in (self.robot.signs, self.robot.default_joint_pos, self.robot.action_scale)
+        self._signs, self._default, self._action_scale, self._posture_offsets = (
+            np.array(x)
+            for x in (
+                self.robot.signs,
+                self.robot.default_joint_pos,
+                self.robot.action_scale,
+                self.robot.posture_offsets,
+            )
         )
         self.reset()
 
@@ -90,6 +96,7 @@ class OnnxPolicy:
         """Begin anew: no history, no last action, gait phase zero."""
         self.action = np.zeros_like(self._mask)
         self._phase = 0.0
+        self._posture = np.zeros(2)
         self._frames: Array | None = None
 
     def step(self, reading: Reading, command: ArrayLike) -> Array:
@@ -102,12 +109,23 @@ class OnnxPolicy:
         Returns:
             PD targets [rad] in the contract's order of joints, shape (n,).
         """
-        inputs = self.observe(reading, np.asarray(command, dtype=np.float64))
+        command = np.asarray(command, dtype=np.float64)
+        inputs = self.observe(reading, command)
         (actions,) = self._session.run(["actions"], {k: v[None].astype(np.float32) for k, v in inputs.items()})
         bound = self.contract.action_clip
         self.action = np.clip(actions[0].astype(np.float64), -bound, bound) * self._mask
         self._phase = (self._phase + self.contract.gait_frequency * self.contract.step_dt) % 1.0
-        return self._default + self._signs * self._action_scale * self.action[self._slots]
+        return self._default + self._signs * (self._bend(command) + self._action_scale * self.action[self._slots])
+
+    def _bend(self, command: Array) -> Array:
+        """Offset of the resting pose from the default pose, canonical, shape (n,)."""
+        posture = self.contract.posture
+        if posture is None:
+            return np.zeros_like(self._default)
+        self._posture = command[3:] + posture.left_over * (self._posture - command[3:])
+        heights = hat_weights(self._posture[0], np.array(posture.heights))
+        pitches = hat_weights(self._posture[1], np.array(posture.pitches))
+        return np.outer(heights, pitches).ravel() @ self._posture_offsets.reshape(-1, len(self._default))
 
     def observe(self, reading: Reading, command: Array) -> dict[str, Array]:
         """Inputs of the network; pushes the reading into the history."""
@@ -151,3 +169,9 @@ def projected_gravity(quat: Array) -> Array:
     """Direction of gravity in a frame of orientation (w, x, y, z), shape (3,)."""
     w, x, y, z = quat / np.linalg.norm(quat)
     return np.array([2.0 * (w * y - x * z), -2.0 * (w * x + y * z), 2.0 * (x * x + y * y) - 1.0])
+
+
+def hat_weights(x: float, nodes: Array) -> Array:
+    """Weights (n,) of linear interpolation between evenly spaced nodes (n,); beyond the ends the last one holds."""
+    distance = np.abs(np.clip(x, nodes[0], nodes[-1]) - nodes) / (nodes[1] - nodes[0])
+    return np.asarray(np.maximum(0.0, 1.0 - distance))

@@ -82,13 +82,16 @@ def _make_runner(job: Job) -> EagleRunner:
     """The runner of a stage, its specialists loaded."""
     cfg, stage = job.cfg, job.stage
     env: VecEnv = job.make_env(stage.robots, cfg.num_envs, cfg.task, stage.seed + job.rank)
-    base = _load(job.base, job)
-    bank = _teachers(job, base)
+    acting_base = _load(job.base, cfg.run.env_device)
     history = cfg.task.observations.history_length
-    if bank is not None and stage.demonstrations:
-        env = DemonstrationEnv(env, bank, env.get_observations()["history"].shape[1] // history)
-    elif base is not None:
-        env = ResidualEnv(env, base)
+    if stage.demonstrations:
+        actors = _teachers(job, acting_base, cfg.run.env_device)
+        assert actors is not None, "a stage of demonstrations has specialists"
+        env = DemonstrationEnv(env, actors, env.get_observations()["history"].shape[1] // history)
+    elif acting_base is not None:
+        env = ResidualEnv(env, acting_base)
+    base = _load(job.base, cfg.run.device)
+    bank = _teachers(job, base, cfg.run.device)
     train_cfg = make_train_cfg(cfg.algo, cfg.run, history_length=history, seed=stage.seed)
     runner = EagleRunner(env, train_cfg, job.folder, cfg.run.device, job.provenance)
     if bank is not None and stage.imitation is not None:
@@ -98,22 +101,23 @@ def _make_runner(job: Job) -> EagleRunner:
     return runner
 
 
-def _load(path: Path | None, job: Job) -> EagleActor | None:
-    return None if path is None else load_actor(path, job.cfg.run.device)[0]
+def _load(path: Path | None, device: str) -> EagleActor | None:
+    return None if path is None else load_actor(path, device)[0]
 
 
-def _teachers(job: Job, base: EagleActor | None) -> SpecialistBank | None:
+def _teachers(job: Job, base: EagleActor | None, device: str) -> SpecialistBank | None:
     """The specialists of a stage that has any."""
-    actors = [load_actor(path, job.cfg.run.device)[0] for path in job.teachers]
+    actors = [load_actor(path, device)[0] for path in job.teachers]
     if not actors:
         return None
     return SpecialistBank(actors) if base is None else ResidualBank(base, actors)
 
 
 def load_policy(job: Job, checkpoint: Path) -> Policy:
-    """The deterministic policy a stage ended with."""
-    actor = load_actor(checkpoint, job.cfg.run.device)[0]
-    base = _load(job.base, job) if job.stage.kind == "residual" else None
+    """The deterministic policy a stage ended with, where the environments are."""
+    device = job.cfg.run.env_device
+    actor = load_actor(checkpoint, device)[0]
+    base = _load(job.base, device) if job.stage.kind == "residual" else None
     return actor if base is None else ResidualPolicy(base, actor)
 
 

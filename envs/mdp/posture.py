@@ -47,7 +47,12 @@ def make_posture(
     if not cfg.posture_reference:
         return DefaultPose(default)
     tables = default.new_tensor(np.stack([posture_table(spec) for spec in robots]))
-    return BentPose(default, tables.flatten(1, 2)[robot_id], math.exp(-step_dt / cfg.posture_time_constant))
+    return BentPose(default, tables.flatten(1, 2)[robot_id], left_over(cfg, step_dt))
+
+
+def left_over(cfg: ControlCfg, step_dt: float) -> float:
+    """Share of the way to the commanded posture that is left after a control step [-]."""
+    return math.exp(-step_dt / cfg.posture_time_constant)
 
 
 class DefaultPose:

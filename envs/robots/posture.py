@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio
 
 from .embodiment import pinocchio_model
-from .slots import SLOT_INDEX
+from .slots import NUM_SLOTS, SLOT_INDEX
 from .spec import FEET, Array, RobotSpec
 
 HEIGHTS = tuple(np.linspace(-0.3, 0.0, 7).tolist())
@@ -45,6 +45,14 @@ def posture_table(spec: RobotSpec) -> Array:
             for column in columns:
                 bend = table[row, column] = legs.solve(HEIGHTS[row], PITCHES[column], bend)
     return table
+
+
+def joint_offsets(spec: RobotSpec) -> Array:
+    """:func:`posture_table` spread over the joints in native order, still canonical, (heights, pitches, n) [rad]."""
+    table = posture_table(spec)
+    slots = np.zeros((*table.shape[:2], NUM_SLOTS))
+    slots[..., np.array(POSTURE_SLOTS)] = table[:, :, None, :]
+    return slots[..., spec.slots]
 
 
 class _Legs:
