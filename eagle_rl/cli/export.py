@@ -82,7 +82,8 @@ def _posture(task: TaskCfg) -> Posture:
     from envs.robots.posture import HEIGHTS, PITCHES
 
     step_dt = task.sim.physics_dt * task.sim.decimation
-    return Posture(heights=HEIGHTS, pitches=PITCHES, left_over=left_over(task.control, step_dt))
+    share, lag = task.control.posture_reference, left_over(task.control, step_dt)
+    return Posture(heights=HEIGHTS, pitches=PITCHES, share=share, left_over=lag)
 
 
 def _robot(spec: RobotSpec, cfg: ExperimentCfg) -> RobotContract:

@@ -68,9 +68,9 @@ class ControlCfg:
     waist_ratio: float = 0.5
     """Extra factor at the waist [-] (ours: the noise of a stiff waist shakes a light pelvis; at 0.5 it makes up half of
     the yaw-rate error H1 has in training)."""
-    posture_reference: bool = False
-    """Whether the targets' resting pose bends to the commanded height and pitch, so that the policy need not learn the
-    kinematics of a squat (ours)."""
+    posture_reference: float = 0.0
+    """Share of the commanded height and pitch to which the targets' resting pose bends by itself, so that the policy
+    need not learn the kinematics of a squat [-]; 0 rests in the default pose (ours)."""
     posture_time_constant: float = 0.25
     """Lag with which that pose follows the command [s] (ours)."""
 

@@ -8,9 +8,10 @@ Canonical angles are ``sign * (q - zero_offset)``; slot arrays hold zero where a
    the right foot; the right foot's phase starts at 0 and gains ``gait_frequency * step_dt`` a step, the left one is
    ahead by ``gait_phase_offset``; both are ``standing_phase`` while the three velocity commands are zero.
 4. ``slot_mask``: 1 in the robot's slots.
-5. PD targets: resting pose + ``action_scale`` * action, both canonical; actions bounded by ``action_clip``. The resting
-   pose is the default one or, where there is a ``posture``, that plus offsets interpolated linearly between its nodes
-   at a height and pitch that follow the command: each step ``1 - posture.left_over`` of the way, from zero at the start.
+5. PD targets: resting pose + ``action_scale`` * action, both canonical; actions bounded by ``action_clip``. The
+   resting pose is the default one or, where there is a ``posture``, that plus offsets interpolated linearly between
+   its nodes at a height and pitch that follow ``posture.share`` of the command: each step ``1 - posture.left_over`` of
+   the way, from zero at the start.
 """
 
 from __future__ import annotations
@@ -71,6 +72,8 @@ class Posture:
     """Nodes, evenly spaced [m]."""
     pitches: Numbers
     """Nodes, evenly spaced [rad]."""
+    share: float
+    """Of the commanded height and pitch that the pose takes over [-]."""
     left_over: float
     """Share of the way to the command that is left after a control step [-]."""
 

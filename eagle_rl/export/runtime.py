@@ -122,7 +122,8 @@ class OnnxPolicy:
         posture = self.contract.posture
         if posture is None:
             return np.zeros_like(self._default)
-        self._posture = command[3:] + posture.left_over * (self._posture - command[3:])
+        target = posture.share * command[3:]
+        self._posture = target + posture.left_over * (self._posture - target)
         heights = hat_weights(self._posture[0], np.array(posture.heights))
         pitches = hat_weights(self._posture[1], np.array(posture.pitches))
         return np.outer(heights, pitches).ravel() @ self._posture_offsets.reshape(-1, len(self._default))

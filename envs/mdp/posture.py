@@ -44,10 +44,11 @@ def make_posture(
         robot_id: index into ``robots``, shape (N,).
         step_dt: control step [s].
     """
-    if not cfg.posture_reference:
+    if cfg.posture_reference == 0.0:
         return DefaultPose(default)
     tables = default.new_tensor(np.stack([posture_table(spec) for spec in robots]))
-    return BentPose(default, tables.flatten(1, 2)[robot_id], left_over(cfg, step_dt))
+    table = tables.flatten(1, 2)[robot_id]
+    return BentPose(default, table, cfg.posture_reference, left_over(cfg, step_dt))
 
 
 def left_over(cfg: ControlCfg, step_dt: float) -> float:
@@ -84,15 +85,16 @@ class BentPose:
     with a lag of the first order, so that a new one is no blow to the joints.
     """
 
-    def __init__(self, default: Tensor, table: Tensor, left_over: float) -> None:
+    def __init__(self, default: Tensor, table: Tensor, share: float, left_over: float) -> None:
         """Start in the default pose.
 
         Args:
             default: canonical [rad], shape (N, 32).
             table: each environment's rows of ``posture_table``, shape (N, heights * pitches, 3).
+            share: of the command that the pose takes over [-].
             left_over: share of the way to the command that is left after a control step [-].
         """
-        self._default, self._table, self._left_over = default, table, left_over
+        self._default, self._table, self._share, self._left_over = default, table, share, left_over
         self._nodes = default.new_tensor(HEIGHTS), default.new_tensor(PITCHES)
         self._slots = torch.tensor(POSTURE_SLOTS, device=default.device)
         self.followed = default.new_zeros(len(default), 2)
@@ -100,7 +102,7 @@ class BentPose:
 
     def advance(self, command: Tensor) -> Tensor:
         """The pose of this control step under the commands (N, 5), canonical [rad], (N, 32)."""
-        self.followed = torch.lerp(command[:, 3:], self.followed, self._left_over)
+        self.followed = torch.lerp(self._share * command[:, 3:], self.followed, self._left_over)
         heights, pitches = map(hat_weights, self.followed.unbind(1), self._nodes)
         weights = (heights.unsqueeze(2) * pitches.unsqueeze(1)).flatten(1)
         bend = torch.einsum("nk,nkj->nj", weights, self._table)
