@@ -71,7 +71,7 @@ class ControlCfg:
     posture_reference: float = 0.0
     """Share of the commanded height and pitch to which the targets' resting pose bends by itself, so that the policy
     need not learn the kinematics of a squat [-]; 0 rests in the default pose (ours)."""
-    posture_time_constant: float = 0.25
+    posture_time_constant: float = 0.5
     """Lag with which that pose follows the command [s] (ours)."""
 
 

@@ -20,8 +20,8 @@ LEG_JOINTS = ("hip_pitch", "knee_pitch", "ankle_pitch")
 POSTURE_SLOTS = tuple(tuple(SLOT_INDEX[f"{side}_{joint}"] for joint in LEG_JOINTS) for side in FEET)
 """Slots of those joints, (2, 3)."""
 
-_WEIGHTS = np.array([0.3, 1.0, 1.0])
-"""What a radian of tilt weighs against a metre, where limits forbid having all."""
+_WEIGHTS = np.array([1.0, 0.5, 1.0])
+"""Of tilt [1/rad], height and balance [1/m]: where limits forbid having all, a robot squats less but on its soles."""
 _ITERATIONS = 40
 _STEP = 1e-6
 """Of the finite differences [rad]."""
