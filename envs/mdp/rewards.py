@@ -73,7 +73,7 @@ def _tracking(squared_error: Tensor, state: PooledState, cfg: RewardsCfg) -> Ten
     if cfg.standing_kappa == cfg.walking_kappa == cfg.tracking_kappa:
         return wide
     kappa = torch.where(state.standing, cfg.standing_kappa, cfg.walking_kappa).to(squared_error.dtype)
-    return 0.5 * (wide + torch.exp(squared_error / -kappa))
+    return 0.5 * (wide + _rho(squared_error, kappa))
 
 
 def _lin_vel_error(state: PooledState, robots: PooledRobots, ctx: RewardContext) -> Tensor:

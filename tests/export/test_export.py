@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from eagle_rl.cli.export import build_contract
 from eagle_rl.cli.sim2sim import MAX_TILT, simulate
 from eagle_rl.config.commands import parse_commands
-from eagle_rl.config.schema import ExperimentCfg
+from eagle_rl.config.schema import ControlCfg, ExperimentCfg, GaitCfg, TaskCfg
 from eagle_rl.errors import CheckpointError, RobotError
 from eagle_rl.evaluation.protocol import evaluation_task
 from eagle_rl.export.contract import METADATA_KEY, Contract
@@ -29,7 +29,11 @@ from envs.robots.load import load_robot
 from tests.policy import untrained_actor
 
 ROBOTS = ("h1", "n1")
-CFG = ExperimentCfg(name="untrained", robots=ROBOTS)
+CFG = ExperimentCfg(
+    name="untrained",
+    robots=ROBOTS,
+    task=TaskCfg(control=ControlCfg(posture_reference=0.8), gait=GaitCfg(frequency=2.0)),
+)
 SCRIPT = parse_commands("- {t: 0}\n- {t: 1, vx: 0.5, wz: 0.3}\n- {t: 2, h: -0.2, p: 0.3, vy: -0.2}")
 
 
@@ -92,7 +96,7 @@ def test_a_changed_contract_is_refused(exported, tmp_path):
     model = onnx.load(exported[1])
     for entry in model.metadata_props:
         if entry.key == METADATA_KEY:
-            entry.value = entry.value.replace('"gait_frequency": 1.5', '"gait_frequency": 2.5')
+            entry.value = entry.value.replace('"gait_frequency": 2.0', '"gait_frequency": 2.5')
     onnx.save(model, tmp_path / "p.onnx")
     with pytest.raises(CheckpointError, match="sha256"):
         OnnxPolicy(tmp_path / "p.onnx", "h1")

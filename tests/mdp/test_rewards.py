@@ -97,7 +97,7 @@ def test_paper_mode_has_the_printed_kernels() -> None:
     cfg = RewardsCfg(orientation="upright")
     kappas = (cfg.tracking_kappa, cfg.contact_vel_kappa, cfg.contact_force_kappa, cfg.foot_slip_kappa)
     assert kappas == (0.25, 5, 50, 1)
-    assert cfg.standing_kappa == cfg.tracking_kappa
+    assert cfg.standing_kappa == cfg.walking_kappa == cfg.tracking_kappa
 
 
 def test_terms_and_weights_have_the_same_names() -> None:
@@ -128,6 +128,25 @@ def test_a_narrower_kernel_is_half_of_the_tracking_rewards_while_standing() -> N
         assert value(term, still, ctx) == pytest.approx(expected), term
     walking = state_with(standing=False, command=[0, 0.2, 0, 0, 0], base_lin_vel_b=[0.1, 0.2, 0])
     assert value("lin_vel_tracking", walking, context(standing_kappa=0.02)) == pytest.approx(math.exp(-0.01 / 0.25))
+
+
+def test_walking_has_a_narrower_kernel_of_its_own() -> None:
+    walking = state_with(
+        standing=False, command=[0.5, 0, 0.4, 0, 0], base_lin_vel_b=[0.3, 0, 0], base_ang_vel_b=[0, 0, 0.1]
+    )
+    ctx = context(walking_kappa=0.05, standing_kappa=0.02)
+    for term, squared in (("lin_vel_tracking", 0.04), ("ang_vel_tracking", 0.09)):
+        expected = 0.5 * (math.exp(-squared / 0.25) + math.exp(-squared / 0.05))
+        assert value(term, walking, ctx) == pytest.approx(expected), term
+
+
+def test_success_is_judged_by_the_table_s_kernel_alone() -> None:
+    state = state_with(
+        standing=False, command=[0.5, 0, 0.4, 0, 0], base_lin_vel_b=[0.3, 0, 0], base_ang_vel_b=[0, 0, 0.1]
+    )
+    lin, ang, *_ = success_scores(state, ROBOTS, context(walking_kappa=0.01, standing_kappa=0.01))
+    assert lin[0].item() == pytest.approx(math.exp(-0.04 / 0.25))
+    assert ang[0].item() == pytest.approx(math.exp(-0.09 / 0.25))
 
 
 def test_ang_vel_tracking() -> None:

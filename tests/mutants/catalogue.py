@@ -28,6 +28,8 @@ SLOTS = "envs/robots/slots.py"
 EMBODIMENT = "envs/robots/embodiment.py"
 POOLING = "envs/pooling.py"
 AIDS = "envs/mdp/aids.py"
+POSTURE = "envs/robots/posture.py"
+RESTING = "envs/mdp/posture.py"
 LOSSES = "eagle_rl/algorithms/losses.py"
 GAUSSIAN = "eagle_rl/models/distribution.py"
 PPO = "eagle_rl/algorithms/eagle_ppo.py"
@@ -54,6 +56,12 @@ MUTANTS: tuple[Mutant, ...] = (
     Mutant(REWARDS, "gravity_x - torch.sin", "gravity_x + torch.sin", REWARD_TESTS),
     Mutant(REWARDS, "* step_dt * (penalty_scale if", "* (penalty_scale if", REWARD_TESTS),
     Mutant(REWARDS, "1.0 - 0.5 * _swing_load", "1.0 - _swing_load", REWARD_TESTS),
+    Mutant(REWARDS, "cfg.standing_kappa, cfg.walking_kappa)", "cfg.walking_kappa, cfg.standing_kappa)", REWARD_TESTS),
+    Mutant(POSTURE, "signs[self._index] * bend", "signs[self._index] * -bend", "robots/test_posture.py"),
+    Mutant(POSTURE, "(0.0, np.sin(pitch / 2)", "(0.0, -np.sin(pitch / 2)", "robots/test_posture.py"),
+    Mutant(POSTURE, "bend + step, self._lower, self._upper", "bend + step, -9, 9", "robots/test_posture.py"),
+    Mutant(RESTING, "self._share * command[:, 3:]", "command[:, 3:]", "mdp/test_posture.py"),
+    Mutant(RESTING, "-step_dt / cfg.posture_time_constant", "-cfg.posture_time_constant", "mdp/test_posture.py"),
     Mutant(
         "envs/mdp/curriculum.py", "penalty_exponent**updates", "penalty_exponent * updates", "mdp/test_curriculum.py"
     ),
