@@ -207,15 +207,20 @@ for _ in range(5):
     ckpt.save_checkpoint(folder, state, Provenance(), iteration=1, env_steps=0)
 duration = (time.monotonic() - start) / 5
 for _ in range(50):
+    begun, begin = os.pipe()
     child = os.fork()
     if child == 0:
         while True:
             newest += 1
+            os.write(begin, b".")
             ckpt.save_checkpoint(folder, state, Provenance(), iteration=newest, env_steps=0)
             ckpt.prune_checkpoints(folder, 2)
-    time.sleep(rng.uniform(0, 3) * duration)
+    for _ in range(rng.randint(1, 3)):  # a busy machine may take long to begin; the moment counts from the last beginning
+        os.read(begun, 1)
+    time.sleep(rng.uniform(0, 1) * duration)
     os.kill(child, signal.SIGKILL)
     os.waitpid(child, 0)
+    os.close(begun), os.close(begin)
     loaded = ckpt.load_checkpoint(ckpt.latest_checkpoint(folder))
     assert torch.equal(loaded.state["weights"], state["weights"])
     assert loaded.manifest["iteration"] >= newest, (loaded.path, newest)
