@@ -215,7 +215,7 @@ for _ in range(50):
             os.write(begin, b".")
             ckpt.save_checkpoint(folder, state, Provenance(), iteration=newest, env_steps=0)
             ckpt.prune_checkpoints(folder, 2)
-    for _ in range(rng.randint(1, 3)):  # a busy machine may take long to begin; the moment counts from the last beginning
+    for _ in range(rng.randint(1, 3)):  # however slow the machine, a save is under way
         os.read(begun, 1)
     time.sleep(rng.uniform(0, 1) * duration)
     os.kill(child, signal.SIGKILL)
