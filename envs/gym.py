@@ -105,7 +105,7 @@ class _Simulation:
         if seed is not None or self._env is None:
             stream = int(generator.integers(2**31))
             self._env = HumanoidEnv(self.task, self.specs, self.num_envs, stream, num_threads=self.num_threads)
-            self._env.final_observations_of_falls = True
+            self._env.final_of_episodes = True
         else:
             self._env.reset()
         return self.env.get_observations()

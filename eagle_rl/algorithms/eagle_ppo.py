@@ -124,11 +124,12 @@ class EaglePPO(PPO):
             return super().act(obs)
 
     def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: Mapping[str, Any]) -> None:
-        """Record one step; a time-out is bootstrapped with the value of its true final observation."""
+        """Record one step; where the environment cuts returns, the value of the true final observation goes on."""
         ids = extras["final_ids"].to(self.device)
         if len(ids):
             final = self.critic(extras["final_observations"].to(self.device)).squeeze(-1)
             rewards = rewards.index_add(0, ids, self.gamma * final)
+            dones = dones.index_fill(0, ids, 1)
         super().process_env_step(obs, rewards, dones, {})
 
     def compute_returns(self, obs: TensorDict) -> None:

@@ -68,8 +68,8 @@ class ActiveCommands:
             self.sampler.accumulate(*scores)
 
     def due(self) -> Tensor:
-        """Environments whose command has been in force for its time, shape (n,)."""
-        return (self.age >= self._interval).nonzero().squeeze(1)
+        """Whether each environment's command has been in force for its time, bool, shape (N,)."""
+        return self.age >= self._interval
 
     def show(self, state: PooledState, phase: Tensor, gait: GaitCfg) -> None:
         """Let a state, and so the next observation, show the commands now in force."""

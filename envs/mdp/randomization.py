@@ -96,10 +96,14 @@ class Randomizer:
         numbers = self._rng.uniform(stream, count, sum(widths), ids).to(self.friction.dtype)
         return [low + (high - low) * u for ((low, high), _), u in zip(rows, numbers.split(widths, dim=1), strict=True)]
 
+    def pushes_at(self, step: int, step_dt: float) -> bool:
+        """Whether the environments are pushed at the start of a control step."""
+        interval = round(self.cfg.push_interval_s / step_dt)
+        return self.cfg.enabled and interval > 0 and step % interval == interval - 1
+
     def push(self, step: int, penalty_scale: float, step_dt: float) -> None:
         """Push every environment when its time has come; ``step`` counts the control steps since creation."""
-        interval = round(self.cfg.push_interval_s / step_dt)
-        if not self.cfg.enabled or interval == 0 or step % interval != interval - 1:
+        if not self.pushes_at(step, step_dt):
             return
         u = penalty_scale * self._rng.uniform_in(-1.0, 1.0, "push", step, 6)
         everyone = torch.arange(len(u), device=u.device)

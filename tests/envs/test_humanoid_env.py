@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from eagle_rl.config.schema import CommandsCfg, ObservationsCfg, TaskCfg, TerminationsCfg
+from eagle_rl.config.schema import CommandsCfg, ObservationsCfg, RandomizationCfg, TaskCfg, TerminationsCfg
 from eagle_rl.errors import ConfigError
 from envs.humanoid_env import HumanoidEnv
 from envs.mdp.observations import proprioception
@@ -122,6 +122,36 @@ def test_time_outs_come_at_the_time_limit_only_and_carry_the_true_last_observati
         assert extras["final_observations"].batch_size == torch.Size([4 if expected else 0])
         if expected and longer is not None:
             assert_same(extras["final_observations"], longer, "last observations before the reset")
+
+
+def test_returns_are_cut_where_a_new_command_or_a_push_comes_with_the_command_before_it() -> None:
+    """Commands every 5 steps; pushes before the 8th and 16th; a robot that fell is cut by its fall alone."""
+    task = replace(
+        TaskCfg(),
+        commands=CommandsCfg(resampling_time_s=0.1, redraw_after_fall=False),
+        randomization=RandomizationCfg(push_interval_s=0.16),
+    )
+    env, same = make_env(task=task), make_env(task=replace(task, commands=CommandsCfg(resampling_time_s=10.0)))
+    for step in range(1, 20):
+        if step == 10:
+            topple(env, 2)
+        before, dones = env.get_observations()["command"], torch.tensor([False, False, step == 10, False])
+        after, _, ended, extras = env.step(actions(4, step, 0.0))
+        unmoved = same.step(actions(4, step, 0.0))[0]
+        assert torch.equal(ended, dones)
+        cut = [0, 1, 2, 3] if step in (5, 7, 15) else [0, 1, 3] if step == 10 else []
+        assert extras["final_ids"].tolist() == cut, f"returns cut at step {step}"
+        assert torch.equal(extras["final_observations"]["command"], before[extras["final_ids"]])
+        if step == 5:
+            assert not torch.equal(after["command"], before), "no new command came, so the test shows nothing"
+            assert_same(extras["final_observations"], unmoved, "as if the old command went on")
+
+
+def test_for_gymnasium_only_ended_episodes_have_last_observations() -> None:
+    env = make_env(task=replace(TaskCfg(), commands=CommandsCfg(resampling_time_s=0.02)))
+    env.final_of_episodes = True
+    topple(env, 1)
+    assert env.step(actions(4, 0))[3]["final_ids"].tolist() == [1]
 
 
 def test_a_full_episode_lasts_a_thousand_steps() -> None:

@@ -117,7 +117,7 @@ def test_the_gradient_of_update_is_that_of_a_hand_written_sum_of_all_losses():
         )
 
 
-def test_time_outs_are_bootstrapped_with_the_value_of_their_true_final_observation():
+def test_returns_are_cut_and_bootstrapped_with_the_value_of_their_true_final_observation():
     runner = make_runner()
     alg, env = runner.alg, runner.env
     obs = env.get_observations()
@@ -126,12 +126,13 @@ def test_time_outs_are_bootstrapped_with_the_value_of_their_true_final_observati
     extras = {"final_ids": torch.tensor([4, 1]), "final_observations": final, "time_outs": torch.ones(env.num_envs)}
     with torch.no_grad():
         alg.act(obs)
-        alg.process_env_step(obs, torch.full((env.num_envs,), 2.0), torch.ones(env.num_envs), extras)
+        alg.process_env_step(obs, torch.full((env.num_envs,), 2.0), torch.zeros(env.num_envs).bool(), extras)
         values = alg.critic(final)[:, 0]
     expected = torch.full((env.num_envs,), 2.0)
     expected[4] += 0.9 * values[0]
     expected[1] += 0.9 * values[1]
     torch.testing.assert_close(alg.storage.rewards[0, :, 0], expected)
+    assert alg.storage.dones[0, :, 0].nonzero().flatten().tolist() == [1, 4], "nothing flows back across the cut"
     assert abs(values[0] - values[1]) > 1e-3, "the critic cannot tell the two apart, so the test shows nothing"
 
 
