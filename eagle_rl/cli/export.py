@@ -14,7 +14,7 @@ from .policy import load_policy
 
 if TYPE_CHECKING:
     from eagle_rl.config.schema import ExperimentCfg, TaskCfg
-    from eagle_rl.export.contract import Contract, Posture, RobotContract, Term
+    from eagle_rl.export.contract import Contract, Legs, Posture, RobotContract, Term
     from envs.mdp.layout import ObservationTerm
     from envs.robots.spec import Array, RobotSpec
 
@@ -65,7 +65,7 @@ def build_contract(cfg: ExperimentCfg, checkpoint: str, robots: Sequence[str]) -
         gait_frequency=task.gait.frequency,
         gait_phase_offset=task.gait.phase_offset,
         standing_phase=STANDING_PHASE,
-        posture=_posture(cfg.task) if task.control.posture_reference else None,
+        posture=_posture(cfg.task) if _bends(cfg.task) else None,
         robots={spec.name: _robot(spec, cfg) for spec in map(load_robot, robots)},
     )
 
@@ -82,14 +82,37 @@ def _posture(task: TaskCfg) -> Posture:
     from envs.robots.posture import HEIGHTS, PITCHES
 
     step_dt = task.sim.physics_dt * task.sim.decimation
-    share, lag = task.control.posture_reference, left_over(task.control, step_dt)
-    return Posture(heights=HEIGHTS, pitches=PITCHES, share=share, left_over=lag)
+    return Posture(
+        heights=HEIGHTS,
+        pitches=PITCHES,
+        share=task.control.posture_reference,
+        gait_share=task.control.gait_reference,
+        stance_ratio=task.gait.stance_ratio,
+        left_over=left_over(task.control, step_dt),
+    )
+
+
+def _bends(task: TaskCfg) -> bool:
+    """Whether the resting pose follows the command."""
+    return task.control.posture_reference > 0 or task.control.gait_reference > 0
+
+
+def _legs(spec: RobotSpec) -> Legs:
+    from eagle_rl.export.contract import Legs
+    from envs.robots.stride import bend_table, leg_joints, stride_table
+
+    present, joints = leg_joints(spec)
+    return Legs(
+        joints=joints,
+        bends=tuple(bend_table(spec)[..., present].ravel().tolist()),
+        strides=tuple(stride_table(spec)[..., present].ravel().tolist()),
+        swing_height=spec.swing_height,
+    )
 
 
 def _robot(spec: RobotSpec, cfg: ExperimentCfg) -> RobotContract:
     from eagle_rl.export.contract import RobotContract
     from envs.pooling import action_scale
-    from envs.robots.posture import joint_offsets
 
     def numbers(values: Array) -> tuple[float, ...]:
         return tuple(values.tolist())
@@ -105,7 +128,7 @@ def _robot(spec: RobotSpec, cfg: ExperimentCfg) -> RobotContract:
         damping=numbers(spec.damping),
         effort_limit=numbers(spec.effort_limit),
         nominal_height=spec.nominal_height,
-        posture_offsets=numbers(joint_offsets(spec).ravel()) if cfg.task.control.posture_reference else (),
+        legs=_legs(spec) if _bends(cfg.task) else None,
     )
 
 

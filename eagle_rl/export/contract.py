@@ -9,9 +9,7 @@ Canonical angles are ``sign * (q - zero_offset)``; slot arrays hold zero where a
    ahead by ``gait_phase_offset``; both are ``standing_phase`` while the three velocity commands are zero.
 4. ``slot_mask``: 1 in the robot's slots.
 5. PD targets: resting pose + ``action_scale`` * action, both canonical; actions bounded by ``action_clip``. The
-   resting pose is the default one or, where there is a ``posture``, that plus offsets interpolated linearly between
-   its nodes at a height and pitch that follow ``posture.share`` of the command: each step ``1 - posture.left_over`` of
-   the way, from zero at the start.
+   resting pose is the default one or, where there is a ``posture``, that plus what ``stepping.py`` works out from it.
 """
 
 from __future__ import annotations
@@ -23,7 +21,7 @@ from typing import Any
 
 from eagle_rl.errors import CheckpointError
 
-FORMAT = 2
+FORMAT = 3
 METADATA_KEY = "eagle.contract"
 """Entry of the ONNX file's metadata that holds the contract."""
 DIGEST_KEY = "eagle.contract.sha256"
@@ -39,6 +37,21 @@ class Term:
     unit: str
     scale: Numbers
     """Factor of each column."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Legs:
+    """How one robot's legs bend and step; the last index of arrays changes fastest."""
+
+    joints: tuple[tuple[int, ...], ...]
+    """Which of the robot's joints are the left and the right leg's, k each."""
+    bends: Numbers
+    """Canonical offsets [rad] at the nodes of ``posture``: height, pitch, joint; the same for both legs."""
+    strides: Numbers
+    """Canonical offsets at those nodes per unit a foot goes ahead, aside [rad/m] and round [rad/rad]: leg, height,
+    pitch, direction, joint."""
+    swing_height: float
+    """[m]"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,13 +73,13 @@ class RobotContract:
     """Bound on kp * error [N m]."""
     nominal_height: float
     """Base height at height command zero [m]."""
-    posture_offsets: Numbers = ()
-    """Canonical offsets [rad] at the nodes of ``posture``: height, pitch, joint, the last changing fastest."""
+    legs: Legs | None = None
+    """None where the resting pose is the default pose."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Posture:
-    """How the resting pose follows the commanded height and pitch."""
+    """How the resting pose follows the command."""
 
     heights: Numbers
     """Nodes, evenly spaced [m]."""
@@ -74,6 +87,10 @@ class Posture:
     """Nodes, evenly spaced [rad]."""
     share: float
     """Of the commanded height and pitch that the pose takes over [-]."""
+    gait_share: float
+    """Of the commanded velocities at which the legs step [-]."""
+    stance_ratio: float
+    """Share of the cycle a foot is in stance [-]."""
     left_over: float
     """Share of the way to the command that is left after a control step [-]."""
 
@@ -130,7 +147,7 @@ class Contract:
             found = values.pop("format")
             if found != FORMAT:
                 raise CheckpointError(f"{source}: contract of format {found}, expected {FORMAT}. Export it again.")
-            robots = {name: RobotContract(**_tuples(robot)) for name, robot in values.pop("robots").items()}
+            robots = {name: _robot(robot) for name, robot in values.pop("robots").items()}
             frame = tuple(Term(**_tuples(term)) for term in values.pop("frame"))
             command = Term(**_tuples(values.pop("command")))
             nodes = values.pop("posture")
@@ -140,6 +157,13 @@ class Contract:
             raise
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise CheckpointError(f"{source}: its contract is damaged ({error}). Export the policy again.") from error
+
+
+def _robot(values: dict[str, Any]) -> RobotContract:
+    legs = values.pop("legs")
+    if legs is not None:
+        legs = Legs(joints=tuple(map(tuple, legs.pop("joints"))), **_tuples(legs))
+    return RobotContract(legs=legs, **_tuples(values))
 
 
 def _tuples(values: dict[str, Any]) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from eagle_rl.errors import CheckpointError, RobotError, did_you_mean
 
 from .contract import DIGEST_KEY, METADATA_KEY, Contract
+from .stepping import RestingLegs
 
 Array = NDArray[np.float64]
 
@@ -81,14 +82,8 @@ class OnnxPolicy:
         self._slots = np.array(self.robot.slots)
         self._mask = np.zeros(len(self.contract.slots))
         self._mask[self._slots] = 1.0
-        self._signs, self._default, self._action_scale, self._posture_offsets = (
-            np.array(x)
-            for x in (
-                self.robot.signs,
-                self.robot.default_joint_pos,
-                self.robot.action_scale,
-                self.robot.posture_offsets,
-            )
+        self._signs, self._default, self._action_scale = (
+            np.array(x) for x in (self.robot.signs, self.robot.default_joint_pos, self.robot.action_scale)
         )
         self.reset()
 
@@ -96,7 +91,8 @@ class OnnxPolicy:
         """Begin anew: no history, no last action, gait phase zero."""
         self.action = np.zeros_like(self._mask)
         self._phase = 0.0
-        self._posture = np.zeros(2)
+        posture, legs = self.contract.posture, self.robot.legs
+        self._legs = RestingLegs(posture, legs, len(self._slots)) if posture is not None and legs is not None else None
         self._frames: Array | None = None
 
     def step(self, reading: Reading, command: ArrayLike) -> Array:
@@ -119,14 +115,9 @@ class OnnxPolicy:
 
     def _bend(self, command: Array) -> Array:
         """Offset of the resting pose from the default pose, canonical, shape (n,)."""
-        posture = self.contract.posture
-        if posture is None:
+        if self._legs is None:
             return np.zeros_like(self._default)
-        target = posture.share * command[3:]
-        self._posture = target + posture.left_over * (self._posture - target)
-        heights = hat_weights(self._posture[0], np.array(posture.heights))
-        pitches = hat_weights(self._posture[1], np.array(posture.pitches))
-        return np.outer(heights, pitches).ravel() @ self._posture_offsets.reshape(-1, len(self._default))
+        return self._legs.advance(command, self._foot_phases(command), self.contract.gait_frequency)
 
     def observe(self, reading: Reading, command: Array) -> dict[str, Array]:
         """Inputs of the network; pushes the reading into the history."""
@@ -139,7 +130,7 @@ class OnnxPolicy:
         return {
             "history": self._frames.ravel(),
             "command": np.clip(np.array(self.contract.command.scale) * command, -bound, bound),
-            "clock": self._clock(command),
+            "clock": np.sin(2.0 * np.pi * self._foot_phases(command)),
             "slot_mask": self._mask,
         }
 
@@ -160,19 +151,14 @@ class OnnxPolicy:
         out[self._slots] = native
         return out
 
-    def _clock(self, command: Array) -> Array:
-        standing = not command[:3].any()
-        phases = np.array([self._phase + self.contract.gait_phase_offset, self._phase])
-        return np.sin(2.0 * np.pi * (np.full(2, self.contract.standing_phase) if standing else phases))
+    def _foot_phases(self, command: Array) -> Array:
+        """Phase of (left, right) [cycles]."""
+        if not command[:3].any():
+            return np.full(2, self.contract.standing_phase)
+        return np.array([self._phase + self.contract.gait_phase_offset, self._phase])
 
 
 def projected_gravity(quat: Array) -> Array:
     """Direction of gravity in a frame of orientation (w, x, y, z), shape (3,)."""
     w, x, y, z = quat / np.linalg.norm(quat)
     return np.array([2.0 * (w * y - x * z), -2.0 * (w * x + y * z), 2.0 * (x * x + y * y) - 1.0])
-
-
-def hat_weights(x: float, nodes: Array) -> Array:
-    """Weights (n,) of linear interpolation between evenly spaced nodes (n,); beyond the ends the last one holds."""
-    distance = np.abs(np.clip(x, nodes[0], nodes[-1]) - nodes) / (nodes[1] - nodes[0])
-    return np.asarray(np.maximum(0.0, 1.0 - distance))

@@ -1,4 +1,4 @@
-"""The pose that actions are added to: the default pose, or one that follows the commanded posture."""
+"""The pose that actions are added to: the default pose, or one that follows the commands."""
 
 from __future__ import annotations
 
@@ -10,17 +10,25 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from eagle_rl.config.schema import ControlCfg
+from eagle_rl.config.schema import ControlCfg, GaitCfg
 
-from ..robots.posture import HEIGHTS, PITCHES, POSTURE_SLOTS, posture_table
-from ..robots.spec import RobotSpec
+from ..robots.posture import HEIGHTS, PITCHES
+from ..robots.spec import Array, RobotSpec
+from ..robots.stride import LEG_SLOTS, bend_table, stride_table
+from ..state import PooledRobots
+from .gait import stride, swing_target
 
 
 class RestingPose(Protocol):
     """Where the PD targets are while the actions are zero."""
 
-    def advance(self, command: Tensor) -> Tensor:
-        """The pose of this control step under the commands (N, 5), canonical [rad], (N, 32)."""
+    def advance(self, command: Tensor, foot_phase: Tensor) -> Tensor:
+        """The pose of this control step, canonical [rad], (N, 32).
+
+        Args:
+            command: (N, 5).
+            foot_phase: of (left, right) at the end of the step [cycles], (N, 2).
+        """
 
     def reset(self, ids: Tensor) -> None:
         """Begin new episodes, shape (n,)."""
@@ -33,22 +41,24 @@ class RestingPose(Protocol):
 
 
 def make_posture(
-    cfg: ControlCfg, robots: Sequence[RobotSpec], default: Tensor, robot_id: Tensor, step_dt: float
+    cfg: ControlCfg,
+    gait: GaitCfg,
+    specs: Sequence[RobotSpec],
+    robots: PooledRobots,
+    step_dt: float,
 ) -> RestingPose:
     """The resting pose a task asks for.
 
     Args:
-        cfg: whether it follows the commanded posture, and how fast.
-        robots: the pool's robots.
-        default: default pose, canonical [rad], shape (N, 32).
-        robot_id: index into ``robots``, shape (N,).
+        cfg: whether it follows the commands, and how fast.
+        gait: when feet are to be in stance.
+        specs: the pool's robots.
+        robots: constants of each environment's robot, an index into ``specs`` among them.
         step_dt: control step [s].
     """
-    if cfg.posture_reference == 0.0:
-        return DefaultPose(default)
-    tables = default.new_tensor(np.stack([posture_table(spec) for spec in robots]))
-    table = tables.flatten(1, 2)[robot_id]
-    return BentPose(default, table, cfg.posture_reference, left_over(cfg, step_dt))
+    if cfg.posture_reference == 0.0 and cfg.gait_reference == 0.0:
+        return DefaultPose(robots.default_joint_pos)
+    return BentPose(cfg, gait, specs, robots, step_dt)
 
 
 def left_over(cfg: ControlCfg, step_dt: float) -> float:
@@ -63,7 +73,7 @@ class DefaultPose:
         """Rest in ``default``, canonical [rad], (N, 32)."""
         self._default = default
 
-    def advance(self, command: Tensor) -> Tensor:
+    def advance(self, command: Tensor, foot_phase: Tensor) -> Tensor:
         """The default pose."""
         return self._default
 
@@ -79,34 +89,46 @@ class DefaultPose:
 
 
 class BentPose:
-    """The default pose with the legs bent to the commanded height and pitch.
+    """The default pose with the legs bent to the commanded height and pitch, and stepping at the commanded velocity.
 
-    A policy then walks about a bent pose instead of having to learn the kinematics of a squat. The command is followed
-    with a lag of the first order, so that a new one is no blow to the joints.
+    A policy then walks about a bent pose instead of having to learn the kinematics of squats and steps. Commands are
+    followed with a lag of the first order, so that a new one is no blow to the joints.
     """
 
-    def __init__(self, default: Tensor, table: Tensor, share: float, left_over: float) -> None:
-        """Start in the default pose.
-
-        Args:
-            default: canonical [rad], shape (N, 32).
-            table: each environment's rows of ``posture_table``, shape (N, heights * pitches, 3).
-            share: of the command that the pose takes over [-].
-            left_over: share of the way to the command that is left after a control step [-].
-        """
-        self._default, self._table, self._share, self._left_over = default, table, share, left_over
+    def __init__(
+        self, cfg: ControlCfg, gait: GaitCfg, specs: Sequence[RobotSpec], robots: PooledRobots, step_dt: float
+    ) -> None:
+        """Start in the default pose; see :func:`make_posture`."""
+        default = robots.default_joint_pos
+        self._default, self._robot, self._swing_height = default, robots.robot_id, robots.swing_height
+        self._gait, self._share, self._gait_share = gait, cfg.posture_reference, cfg.gait_reference
+        self._left_over = left_over(cfg, step_dt)
         self._nodes = default.new_tensor(HEIGHTS), default.new_tensor(PITCHES)
-        self._slots = torch.tensor(POSTURE_SLOTS, device=default.device)
-        self.followed = default.new_zeros(len(default), 2)
-        """Height offset [m] and pitch [rad] the legs are bent to, shape (N, 2)."""
+        self._slots = torch.tensor(LEG_SLOTS, device=default.device).flatten()
+        self._bends = _by_node(default, [bend_table(spec) for spec in specs])
+        self._strides = _by_node(default, [np.moveaxis(stride_table(spec), 0, 2) for spec in specs])
+        self.followed = default.new_zeros(len(default), 5)
+        """Command the legs are at, shape (N, 5)."""
 
-    def advance(self, command: Tensor) -> Tensor:
-        """The pose of this control step under the commands (N, 5), canonical [rad], (N, 32)."""
-        self.followed = torch.lerp(self._share * command[:, 3:], self.followed, self._left_over)
-        heights, pitches = map(hat_weights, self.followed.unbind(1), self._nodes)
+    def advance(self, command: Tensor, foot_phase: Tensor) -> Tensor:
+        """The pose of this control step, canonical [rad], (N, 32)."""
+        self.followed = torch.lerp(command, self.followed, self._left_over)
+        height, pitch = (self._share * self.followed[:, 3:]).unbind(1)
+        if self._gait_share == 0.0:
+            return self._default.index_add(1, self._slots, self._look_up(self._bends, height, pitch).repeat(1, 2))
+        lift = self._gait_share * swing_target(foot_phase, self._swing_height, self._gait)
+        bends = torch.stack([self._look_up(self._bends, height - lift[:, foot], pitch) for foot in range(2)], dim=1)
+        moved = self._gait_share * stride(foot_phase, self._gait).unsqueeze(2) * self.followed[:, None, :3]
+        strides = self._look_up(self._strides, height, pitch).unflatten(1, (2, 3, -1))
+        legs = bends + (moved.unsqueeze(3) * strides).sum(dim=2)
+        return self._default.index_add(1, self._slots, legs.flatten(1))
+
+    def _look_up(self, table: Tensor, height: Tensor, pitch: Tensor) -> Tensor:
+        """Each environment's row of a table by node, at a height and pitch, (N,) each; shape (N, columns)."""
+        heights, pitches = (hat_weights(x, nodes) for x, nodes in zip((height, pitch), self._nodes, strict=True))
         weights = (heights.unsqueeze(2) * pitches.unsqueeze(1)).flatten(1)
-        bend = torch.einsum("nk,nkj->nj", weights, self._table)
-        return self._default.index_add(1, self._slots.flatten(), torch.cat([bend, bend], dim=1))
+        rows = (weights @ table.flatten(1)).unflatten(1, table.shape[1:])
+        return rows[torch.arange(len(rows), device=rows.device), self._robot]
 
     def reset(self, ids: Tensor) -> None:
         """Back to the default pose, shape (n,)."""
@@ -119,6 +141,12 @@ class BentPose:
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Restore what :meth:`state_dict` returned."""
         self.followed = state["followed"].to(self.followed, copy=True)
+
+
+def _by_node(like: Tensor, tables: Sequence[Array]) -> Tensor:
+    """One table (heights, pitches, ...) of each robot as (heights * pitches, robots, columns)."""
+    stacked = like.new_tensor(np.stack(tables, axis=2))
+    return stacked.flatten(0, 1).flatten(2)
 
 
 def hat_weights(x: Tensor, nodes: Tensor) -> Tensor:

@@ -8,16 +8,17 @@ import numpy as np
 import pinocchio
 
 from .embodiment import pinocchio_model
-from .slots import NUM_SLOTS, SLOT_INDEX
+from .slots import SLOT_INDEX
 from .spec import FEET, Array, RobotSpec
 
-HEIGHTS = tuple(np.linspace(-0.3, 0.0, 7).tolist())
+HEIGHTS = tuple(np.linspace(-0.4, 0.0, 9).tolist())
 PITCHES = tuple(np.linspace(-0.3, 0.5, 9).tolist())
-"""Nodes of :func:`posture_table`: height offset [m] and pitch [rad], the finishing ranges of the paper's commands."""
+"""Nodes of :func:`posture_table`: height offset [m] and pitch [rad], the finishing ranges of the paper's commands and
+room to lift a foot in the deepest squat."""
 
-LEG_JOINTS = ("hip_pitch", "knee_pitch", "ankle_pitch")
+PITCH_JOINTS = ("hip_pitch", "knee_pitch", "ankle_pitch")
 """What bends, the same on both legs."""
-POSTURE_SLOTS = tuple(tuple(SLOT_INDEX[f"{side}_{joint}"] for joint in LEG_JOINTS) for side in FEET)
+POSTURE_SLOTS = tuple(tuple(SLOT_INDEX[f"{side}_{joint}"] for joint in PITCH_JOINTS) for side in FEET)
 """Slots of those joints, (2, 3)."""
 
 _WEIGHTS = np.array([1.0, 0.5, 1.0])
@@ -36,7 +37,7 @@ def posture_table(spec: RobotSpec) -> Array:
     centre of mass is as far ahead of them. Where joint limits forbid it, the nearest pose they allow.
     """
     legs = _Legs(spec)
-    table = np.zeros((len(HEIGHTS), len(PITCHES), len(LEG_JOINTS)))
+    table = np.zeros((len(HEIGHTS), len(PITCHES), len(PITCH_JOINTS)))
     upright = int(np.argmin(np.abs(PITCHES)))
     for row in reversed(range(len(HEIGHTS))):  # from the default pose outwards, each from its neighbour's solution
         start = table[min(row + 1, len(HEIGHTS) - 1), upright]
@@ -45,14 +46,6 @@ def posture_table(spec: RobotSpec) -> Array:
             for column in columns:
                 bend = table[row, column] = legs.solve(HEIGHTS[row], PITCHES[column], bend)
     return table
-
-
-def joint_offsets(spec: RobotSpec) -> Array:
-    """:func:`posture_table` spread over the joints in native order, still canonical, (heights, pitches, n) [rad]."""
-    table = posture_table(spec)
-    slots = np.zeros((*table.shape[:2], NUM_SLOTS))
-    slots[..., np.array(POSTURE_SLOTS)] = table[:, :, None, :]
-    return slots[..., spec.slots]
 
 
 class _Legs:
