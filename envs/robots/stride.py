@@ -9,7 +9,7 @@ import pinocchio
 
 from .embodiment import pinocchio_model
 from .posture import HEIGHTS, PITCHES, POSTURE_SLOTS, posture_table
-from .slots import SLOT_INDEX
+from .slots import MIRROR_SIGN, SLOT_INDEX
 from .spec import FEET, Array, RobotSpec
 
 LEG_JOINTS = ("hip_pitch", "hip_roll", "hip_yaw", "knee_pitch", "ankle_pitch", "ankle_roll")
@@ -18,6 +18,8 @@ LEG_SLOTS = tuple(tuple(SLOT_INDEX[f"{side}_{joint}"] for joint in LEG_JOINTS) f
 DIRECTIONS = 3
 """Ahead [m], aside [m], and round the vertical through the base [rad]."""
 
+_MIRROR = np.outer([1.0, -1.0, -1.0], MIRROR_SIGN[list(LEG_SLOTS[0])])
+"""Sign of each direction times that of each joint: what the left leg's offsets are to the right one's."""
 _WEIGHTS = np.array([1.0, 1.0, 1.0, 0.05, 0.3, 0.3])
 """Of a foot's place [1/m] and of its roll, pitch and yaw [1/rad]: who cannot roll the ankle rolls the sole."""
 _DAMPING = 1e-5
@@ -71,7 +73,8 @@ def stride_table(spec: RobotSpec) -> Array:
             sole = place.rotation @ spec.sole_offsets[foot]
             jacobian[:3] += np.cross(jacobian[3:].T, sole).T
             table[foot, row, column][:, present] = _solve(jacobian, place.translation + sole)
-    return table
+    left = 0.5 * (table[0] + _MIRROR * table[1])  # the vendors' numbers differ a little between left and right
+    return np.stack([left, _MIRROR * left])
 
 
 def _solve(jacobian: Array, sole: Array) -> Array:
