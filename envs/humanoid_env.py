@@ -165,9 +165,8 @@ class HumanoidEnv(VecEnv):
 
         Returns:
             Observations after resets, rewards (N,), dones (N,), and extras with ``time_outs``, ``log``, how long the
-            physics took [s] (``physics_time``), and the true last observations (``final_observations``) of the
-            environments ``final_ids``, where returns are to be cut and bootstrapped: those that timed out and those
-            about to get a new command or a push.
+            physics took [s] (``physics_time``), and ``final_observations`` of the environments ``final_ids``, whose
+            returns are to end there and be bootstrapped: they timed out, or get a new command or a push next.
         """
         self._last_joint_vel, self._last_contact = self.state.joint_vel, self.state.foot_contact
         self._physics_step(self._act(actions))
@@ -251,12 +250,7 @@ class HumanoidEnv(VecEnv):
     # --- parts of the step --------------------------------------------------------------------------------------------
 
     def _about_to_be_surprised(self) -> Tensor:
-        """Where a new command or a push comes before the next step, bool (N,).
-
-        No action brings these about, yet their effect on the return is 7 to 30 times the usual TD error: unless the
-        return is cut before them, they are half to four fifths of the variance of what PPO learns from
-        (docs/experiments.md, section 14).
-        """
+        """Where a new command or a push comes before the next step: noise to who learns (docs/experiments.md, 14)."""
         due = self.commands.due()
         return torch.ones_like(due) if self.randomizer.pushes_at(self.common_step_counter, self.step_dt) else due
 

@@ -30,9 +30,11 @@ POOLING = "envs/pooling.py"
 AIDS = "envs/mdp/aids.py"
 POSTURE = "envs/robots/posture.py"
 RESTING = "envs/mdp/posture.py"
+STRIDE = "envs/robots/stride.py"
 LOSSES = "eagle_rl/algorithms/losses.py"
 GAUSSIAN = "eagle_rl/models/distribution.py"
 PPO = "eagle_rl/algorithms/eagle_ppo.py"
+ENV = "envs/humanoid_env.py"
 AUXILIARY = "eagle_rl/algorithms/auxiliary.py"
 
 REWARD_TESTS = "mdp/test_rewards.py"
@@ -60,7 +62,13 @@ MUTANTS: tuple[Mutant, ...] = (
     Mutant(POSTURE, "signs[self._index] * bend", "signs[self._index] * -bend", "robots/test_posture.py"),
     Mutant(POSTURE, "(0.0, np.sin(pitch / 2)", "(0.0, -np.sin(pitch / 2)", "robots/test_posture.py"),
     Mutant(POSTURE, "bend + step, self._lower, self._upper", "bend + step, -9, 9", "robots/test_posture.py"),
-    Mutant(RESTING, "self._share * command[:, 3:]", "command[:, 3:]", "mdp/test_posture.py"),
+    Mutant(RESTING, "(self._share * self.followed[:, 3:])", "(self.followed[:, 3:])", "mdp/test_posture.py"),
+    Mutant(RESTING, "height - lift[:, foot]", "height + lift[:, foot]", "mdp/test_posture.py"),
+    Mutant(STRIDE, "wanted[:2, 2] = -sole[1], sole[0]", "wanted[:2, 2] = sole[1], -sole[0]", "mdp/test_posture.py"),
+    Mutant(STRIDE, "np.cross(jacobian[3:].T, sole)", "np.cross(sole, jacobian[3:].T)", "mdp/test_posture.py"),
+    Mutant(STRIDE, "[left, _MIRROR * left]", "[left, left]", "envs/test_mirrored_dynamics.py"),
+    Mutant(GAIT, "0.5 - 2.0 * phase", "2.0 * phase - 0.5", "mdp/test_posture.py"),
+    Mutant("eagle_rl/export/stepping.py", "0.5 - 2.0 * cycle", "2.0 * cycle - 0.5", "export/test_export.py"),
     Mutant(RESTING, "-step_dt / cfg.posture_time_constant", "-cfg.posture_time_constant", "mdp/test_posture.py"),
     Mutant(
         "envs/mdp/curriculum.py", "penalty_exponent**updates", "penalty_exponent * updates", "mdp/test_curriculum.py"
@@ -167,6 +175,8 @@ MUTANTS: tuple[Mutant, ...] = (
     ),
     Mutant(GAUSSIAN, "kl_divergence(old, new).sum", "kl_divergence(new, old).sum", "learner/test_distribution.py"),
     Mutant(PPO, "self.gamma * final", "final", LEARNER_TESTS),
+    Mutant(PPO, "dones = dones.index_fill(0, ids, 1)", "dones = dones.clone()", LEARNER_TESTS),
+    Mutant(ENV, "time_outs | (self._about_to_be_surprised() & ~dones)", "time_outs", "envs/test_humanoid_env.py"),
     Mutant(
         PPO, "self.learning_rate / LEARNING_RATE_FACTOR", "self.learning_rate * LEARNING_RATE_FACTOR", LEARNER_TESTS
     ),
