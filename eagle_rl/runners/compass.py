@@ -74,14 +74,12 @@ class _Wrapper(VecEnv):
     def __getattr__(self, name: str) -> Any:
         return getattr(self.env, name)
 
-    @property
-    def episode_length_buf(self) -> Tensor:
-        """Age of each episode [steps], shape (N,)."""
-        return self.env.episode_length_buf
-
-    @episode_length_buf.setter
-    def episode_length_buf(self, value: Tensor) -> None:
-        self.env.episode_length_buf = value
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Set what the environment has there, where the learner means it: age of episodes, pooling, fault folder."""
+        if name == "env" or not hasattr(self.env, name):
+            super().__setattr__(name, value)
+        else:
+            setattr(self.env, name, value)
 
 
 class ResidualEnv(_Wrapper):

@@ -112,3 +112,17 @@ def test_imitation_stages_learn_nothing_but_imitation(run):
         for stage in ("compass/base", "compass/distill")
     ]
     assert all(torch.equal(critics[0][key], critics[1][key]) for key in critics[0]), "the critic has no part in it"
+
+
+def test_what_the_learner_sets_on_a_wrapper_reaches_the_environment(actors):
+    """Set on the wrapper itself, faults would not be kept and processes would not share their curriculum."""
+    inner = make_env()
+    inner.fault_folder = None
+    inner.over_processes = None
+    wrapped = ResidualEnv(inner, actors[0])
+    wrapped.fault_folder, wrapped.over_processes = "faults", max
+    wrapped.episode_length_buf = torch.ones(inner.num_envs, dtype=torch.long)
+    assert (inner.fault_folder, inner.over_processes) == ("faults", max)
+    assert inner.episode_length_buf.all()
+    assert wrapped.episode_length_buf is inner.episode_length_buf
+    assert not hasattr(inner, "base"), "the wrapper's own parts stay with it"
