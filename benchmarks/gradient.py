@@ -90,7 +90,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     if args.envs <= 0 or args.envs % (64 * robots):
         parser.error(f"--envs: got {args.envs}, expected a multiple of {64 * robots} for {robots} robots")
     runner = make_runner(cfg, make_env_factory(cfg.run)(cfg.robots, args.envs, cfg.task, SEED))
-    runner.load_weights(policy.checkpoint)
+    runner.alg.load(torch.load(policy.checkpoint, weights_only=True)["algorithm"], {"actor": True, "critic": True})
     for _ in range(_WARM_UP):
         collect(runner)
         runner.alg.storage.clear()
@@ -102,7 +102,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     batch = 64 * robots * cfg.algo.num_steps_per_env
     for lam, grads in found.items():
         scatter, mean, samples = noise_scale(grads, batch)
-        print(f"lambda {lam}: tr {scatter:.3g}, |G|^2 {mean:.3g}, half noise at {samples:.3g} samples ({len(grads)} x {batch})")
+        half = f"half noise at {samples:.3g} samples" if mean > 0 else "mean not resolved: more --rollouts"
+        print(f"lambda {lam}: tr {scatter:.3g}, |G|^2 {mean:.3g}, {half}; {len(grads)} batches of {batch}")
 
 
 if __name__ == "__main__":
