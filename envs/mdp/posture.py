@@ -105,8 +105,8 @@ class BentPose:
         self._left_over = left_over(cfg, step_dt)
         self._nodes = default.new_tensor(HEIGHTS), default.new_tensor(PITCHES)
         self._slots = torch.tensor(LEG_SLOTS, device=default.device).flatten()
-        self._bends = _by_node(default, [bend_table(spec) for spec in specs])
-        self._strides = _by_node(default, [np.moveaxis(stride_table(spec), 0, 2) for spec in specs])
+        self._bends = _by_robot(default, [bend_table(spec) for spec in specs])
+        self._strides = _by_robot(default, [np.moveaxis(stride_table(spec), 0, 2) for spec in specs])
         self.followed = default.new_zeros(len(default), 5)
         """Command the legs are at, shape (N, 5)."""
 
@@ -124,11 +124,16 @@ class BentPose:
         return self._default.index_add(1, self._slots, legs.flatten(1))
 
     def _look_up(self, table: Tensor, height: Tensor, pitch: Tensor) -> Tensor:
-        """Each environment's row of a table by node, at a height and pitch, (N,) each; shape (N, columns)."""
-        heights, pitches = (hat_weights(x, nodes) for x, nodes in zip((height, pitch), self._nodes, strict=True))
-        weights = (heights.unsqueeze(2) * pitches.unsqueeze(1)).flatten(1)
-        rows = (weights @ table.flatten(1)).unflatten(1, table.shape[1:])
-        return rows[torch.arange(len(rows), device=rows.device), self._robot]
+        """Each environment's row of a table, interpolated at a height and pitch, (N,) each; shape (N, columns).
+
+        Without a matrix product, whose last bits depend on how many environments there are.
+        """
+        (row, down), (column, along) = (cell(x, nodes) for x, nodes in zip((height, pitch), self._nodes, strict=True))
+        above, below = (
+            torch.lerp(table[self._robot, r, column], table[self._robot, r, column + 1], along.unsqueeze(1))
+            for r in (row, row + 1)
+        )
+        return torch.lerp(above, below, down.unsqueeze(1))
 
     def reset(self, ids: Tensor) -> None:
         """Back to the default pose, shape (n,)."""
@@ -143,14 +148,13 @@ class BentPose:
         self.followed = state["followed"].to(self.followed, copy=True)
 
 
-def _by_node(like: Tensor, tables: Sequence[Array]) -> Tensor:
-    """One table (heights, pitches, ...) of each robot as (heights * pitches, robots, columns)."""
-    stacked = like.new_tensor(np.stack(tables, axis=2))
-    return stacked.flatten(0, 1).flatten(2)
+def _by_robot(like: Tensor, tables: Sequence[Array]) -> Tensor:
+    """One table (heights, pitches, ...) of each robot as (robots, heights, pitches, columns)."""
+    return like.new_tensor(np.stack(tables)).flatten(3)
 
 
-def hat_weights(x: Tensor, nodes: Tensor) -> Tensor:
-    """Weights (N, n) of linear interpolation between evenly spaced nodes (n,); beyond the ends the last one holds."""
-    spacing = nodes[1] - nodes[0]
-    inside = x.clamp(nodes[0], nodes[-1]).unsqueeze(1)
-    return (1.0 - (inside - nodes).abs() / spacing).clamp(min=0.0)
+def cell(x: Tensor, nodes: Tensor) -> tuple[Tensor, Tensor]:
+    """Index of the node below and share of the way to the next, (N,) each, for evenly spaced nodes (n,); ends hold."""
+    place = ((x - nodes[0]) / (nodes[1] - nodes[0])).clamp(0.0, len(nodes) - 1.0)
+    below = place.floor().clamp(max=len(nodes) - 2.0)
+    return below.long(), place - below

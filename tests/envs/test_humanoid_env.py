@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from eagle_rl.config.schema import CommandsCfg, ObservationsCfg, RandomizationCfg, TaskCfg, TerminationsCfg
+from eagle_rl.config.schema import CommandsCfg, ControlCfg, ObservationsCfg, RandomizationCfg, TaskCfg, TerminationsCfg
 from eagle_rl.errors import ConfigError
 from envs.humanoid_env import HumanoidEnv
 from envs.mdp.observations import proprioception
@@ -175,7 +175,8 @@ def test_actions_in_absent_slots_change_nothing() -> None:
 @pytest.mark.parametrize("name", ["h1", "g1", "t1"])
 def test_a_robot_does_the_same_alone_and_in_company(name: str) -> None:
     fleet = ["h1", "g1", "t1"]
-    pooled, alone = make_env(fleet, 9), make_env([name], 3)
+    task = replace(TaskCfg(), control=ControlCfg(posture_reference=1.0, gait_reference=1.0))
+    pooled, alone = make_env(fleet, 9, task), make_env([name], 3, task)
     rows = slice(3 * fleet.index(name), 3 * fleet.index(name) + 3)
     for step in range(60):
         command = actions(3, step).repeat(3, 1)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from eagle_rl.config.schema import ControlCfg, GaitCfg, RewardsCfg, SimCfg
 from eagle_rl.export import stepping
-from envs.mdp.posture import BentPose, DefaultPose, hat_weights, make_posture
+from envs.mdp.posture import BentPose, DefaultPose, cell, make_posture
 from envs.pooling import pool_robots
 from envs.robots.load import load_robot
 from envs.robots.model import build_model
@@ -40,11 +40,12 @@ def commands(height, pitch):
 @given(st.lists(st.floats(-1.0, 1.0), min_size=1, max_size=5))
 def test_interpolation_is_exact_on_straight_lines_and_holds_beyond_the_ends(values):
     x = torch.tensor(values, dtype=torch.float64)
-    weights = hat_weights(x, NODES)
-    torch.testing.assert_close(weights.sum(dim=1), torch.ones_like(x))
-    torch.testing.assert_close(weights @ NODES, x.clamp(NODES[0], NODES[-1]))
-    for value, row in zip(values, weights, strict=True):
-        np.testing.assert_allclose(stepping.hat_weights(value, np.array(PITCHES)), row, atol=1e-12)
+    below, share = cell(x, NODES)
+    torch.testing.assert_close(torch.lerp(NODES[below], NODES[below + 1], share), x.clamp(NODES[0], NODES[-1]))
+    for value, node, part in zip(values, below.tolist(), share.tolist(), strict=True):
+        weights = np.zeros(len(PITCHES))
+        weights[node : node + 2] = 1.0 - part, part
+        np.testing.assert_allclose(stepping.hat_weights(value, np.array(PITCHES)), weights, atol=1e-12)
 
 
 def test_the_paper_s_pose_is_the_default_one():
