@@ -106,7 +106,7 @@ class HumanoidEnv(VecEnv):
             for spec, count in zip(robots, counts, strict=True)
         ]
         self.pool = PhysicsPool(batches, self.device, dtype, overlap=num_threads != 1)
-        nominal = pool_robots(robots, counts, task.control, task.rewards, self.device, dtype)
+        nominal = pool_robots(robots, counts, task, self.device, dtype)
         self.rng = CounterRng(
             seed,
             [name for name, count in zip(self.robot_names, counts, strict=True) for _ in range(count)],
@@ -172,7 +172,7 @@ class HumanoidEnv(VecEnv):
         self._physics_step(self._act(actions))
         self.common_step_counter += 1
         self.episode_length_buf = self.episode_length_buf + 1
-        self.phase = advance_phase(self.phase, self.step_dt, self.task.gait)
+        self.phase = advance_phase(self.phase, self.step_dt, self.robots.gait_frequency)
 
         causes = self.pool.causes()
         sick = causes > 0
@@ -260,7 +260,7 @@ class HumanoidEnv(VecEnv):
         sound = actions.abs() <= MAX_ACTION
         self._last_last_actions, self._last_actions = self._last_actions, self._actions
         self._actions = torch.where(live & sound, actions.to(self._actions.dtype).clamp(-clip, clip), 0.0)
-        soon = advance_phase(self.phase, self.step_dt, self.task.gait)
+        soon = advance_phase(self.phase, self.step_dt, self.robots.gait_frequency)
         rest = self.posture.advance(self.command, foot_phases(soon, self.commands.standing, self.task.gait))
         targets = rest + self.robots.action_scale * self._actions
         absurd = (live & ~sound).any(dim=1, keepdim=True)

@@ -8,12 +8,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from eagle_rl.config.schema import ControlCfg, RewardsCfg
+from eagle_rl.config.schema import ControlCfg, GaitCfg, TaskCfg
 from eagle_rl.errors import ConfigError
 
+from .robots.posture import leg_length
 from .robots.slots import HIP_YAW_SLOTS, LEG_PITCH_SLOTS, NUM_SLOTS, UPPER_SLOTS, WAIST_SLOTS
 from .robots.spec import Array, RobotSpec
 from .state import PooledRobots
+
+REFERENCE_LEG = 0.87
+"""Leg of H1 [m], whose gait frequency the configuration gives."""
 
 
 def share(num_envs: int, num_robots: int) -> list[int]:
@@ -42,6 +46,11 @@ def action_scale(spec: RobotSpec, cfg: ControlCfg) -> Array:
     return cfg.action_scale * extra * spec.to_slots(ratio)
 
 
+def gait_frequency(spec: RobotSpec, cfg: GaitCfg) -> float:
+    """Steps of one foot per second [Hz]; see ``GaitCfg.leg_scaling``."""
+    return float(cfg.frequency * (REFERENCE_LEG / leg_length(spec)) ** cfg.leg_scaling)
+
+
 def soft_limits(spec: RobotSpec, ratio: float) -> tuple[Array, Array]:
     """Canonical limits shrunk about their middle by ``ratio`` [rad], shape (32,) each."""
     ends = spec.signs * np.stack([spec.joint_lower - spec.zero_offsets, spec.joint_upper - spec.zero_offsets])
@@ -53,13 +62,12 @@ def soft_limits(spec: RobotSpec, ratio: float) -> tuple[Array, Array]:
 def pool_robots(
     specs: Sequence[RobotSpec],
     counts: Sequence[int],
-    control: ControlCfg,
-    rewards: RewardsCfg,
+    task: TaskCfg,
     device: torch.device,
     dtype: torch.dtype,
 ) -> PooledRobots:
     """Repeat each robot's constants over its environments."""
-    limits = [soft_limits(spec, rewards.soft_limit_ratio) for spec in specs]
+    limits = [soft_limits(spec, task.rewards.soft_limit_ratio) for spec in specs]
 
     def repeat(values: Sequence[Array | float]) -> Tensor:
         rows = torch.as_tensor(np.stack([np.asarray(value, dtype=np.float64) for value in values]))
@@ -71,8 +79,9 @@ def pool_robots(
         default_joint_pos=repeat([spec.to_canonical(spec.default_joint_pos) for spec in specs]),
         joint_soft_lower=repeat([lower for lower, _ in limits]),
         joint_soft_upper=repeat([upper for _, upper in limits]),
-        action_scale=repeat([action_scale(spec, control) for spec in specs]),
+        action_scale=repeat([action_scale(spec, task.control) for spec in specs]),
         nominal_height=repeat([spec.nominal_height for spec in specs]),
         swing_height=repeat([spec.swing_height for spec in specs]),
         total_mass=repeat([spec.total_mass for spec in specs]),
+        gait_frequency=repeat([gait_frequency(spec, task.gait) for spec in specs]),
     )

@@ -47,6 +47,8 @@ class PooledRobots(_Rows):
     """[m], shape (N,)."""
     total_mass: Tensor
     """Nominal mass [kg], shape (N,)."""
+    gait_frequency: Tensor
+    """Steps of one foot per second [Hz], shape (N,)."""
 
 
 @dataclass(kw_only=True)

@@ -37,6 +37,7 @@ def random_robots(seed: int, num_envs: int = 8, num_robots: int = 2, symmetric: 
         nominal_height=uniform(num_envs, low=0.5),
         swing_height=uniform(num_envs, low=0.08, high=0.15),
         total_mass=uniform(num_envs, low=30.0, high=60.0),
+        gait_frequency=uniform(num_envs, low=1.5, high=2.5),
     )
     return _symmetrised(robots) if symmetric else robots
 

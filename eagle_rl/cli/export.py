@@ -62,7 +62,6 @@ def build_contract(cfg: ExperimentCfg, checkpoint: str, robots: Sequence[str]) -
         command=_term(groups["command"][0]),
         observation_clip=task.observations.clip,
         action_clip=task.control.action_clip,
-        gait_frequency=task.gait.frequency,
         gait_phase_offset=task.gait.phase_offset,
         standing_phase=STANDING_PHASE,
         posture=_posture(cfg.task) if _bends(cfg.task) else None,
@@ -112,7 +111,7 @@ def _legs(spec: RobotSpec) -> Legs:
 
 def _robot(spec: RobotSpec, cfg: ExperimentCfg) -> RobotContract:
     from eagle_rl.export.contract import RobotContract
-    from envs.pooling import action_scale
+    from envs.pooling import action_scale, gait_frequency
 
     def numbers(values: Array) -> tuple[float, ...]:
         return tuple(values.tolist())
@@ -128,6 +127,7 @@ def _robot(spec: RobotSpec, cfg: ExperimentCfg) -> RobotContract:
         damping=numbers(spec.damping),
         effort_limit=numbers(spec.effort_limit),
         nominal_height=spec.nominal_height,
+        gait_frequency=gait_frequency(spec, cfg.task.gait),
         legs=_legs(spec) if _bends(cfg.task) else None,
     )
 

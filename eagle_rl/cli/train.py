@@ -97,9 +97,9 @@ def main(argv: Sequence[str]) -> int:
 
     from eagle_rl.runners.team import Team
 
-    team = Team(cfg.run.device)
-    run_dir = args.resume or team.agree(lambda: create_run(cfg, args.out, provenance))
-    _train(cfg, run_dir, args, provenance, team)
+    with Team(cfg.run.device) as team:
+        run_dir = args.resume or team.agree(lambda: create_run(cfg, args.out, provenance))
+        _train(cfg, run_dir, args, provenance, team)
     return 0
 
 

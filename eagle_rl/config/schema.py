@@ -135,6 +135,9 @@ class GaitCfg:
 
     frequency: float = 1.5
     """Steps of one foot per second [Hz]; not in the paper's command (ours: nearest to the public gaits of all five)."""
+    leg_scaling: float = 0.0
+    """How much quicker short legs step: H1 has this frequency, others (0.87 m / leg length) to this power times it.
+    0 is one clock for all, 0.5 the dynamic similarity of walking animals, an equal Froude number (ours)."""
     phase_offset: float = 0.5
     """Phase of the left foot ahead of the right [-]; 0.5 walks (HugWBC 1)."""
     stance_ratio: float = 0.5

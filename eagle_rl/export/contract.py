@@ -21,7 +21,7 @@ from typing import Any
 
 from eagle_rl.errors import CheckpointError
 
-FORMAT = 3
+FORMAT = 4
 METADATA_KEY = "eagle.contract"
 """Entry of the ONNX file's metadata that holds the contract."""
 DIGEST_KEY = "eagle.contract.sha256"
@@ -73,6 +73,8 @@ class RobotContract:
     """Bound on kp * error [N m]."""
     nominal_height: float
     """Base height at height command zero [m]."""
+    gait_frequency: float
+    """[Hz]"""
     legs: Legs | None = None
     """None where the resting pose is the default pose."""
 
@@ -112,8 +114,6 @@ class Contract:
     command: Term
     observation_clip: float
     action_clip: float
-    gait_frequency: float
-    """[Hz]"""
     gait_phase_offset: float
     """[cycles]"""
     standing_phase: float

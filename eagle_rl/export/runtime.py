@@ -110,14 +110,14 @@ class OnnxPolicy:
         (actions,) = self._session.run(["actions"], {k: v[None].astype(np.float32) for k, v in inputs.items()})
         bound = self.contract.action_clip
         self.action = np.clip(actions[0].astype(np.float64), -bound, bound) * self._mask
-        self._phase = (self._phase + self.contract.gait_frequency * self.contract.step_dt) % 1.0
+        self._phase = (self._phase + self.robot.gait_frequency * self.contract.step_dt) % 1.0
         return self._default + self._signs * (self._bend(command) + self._action_scale * self.action[self._slots])
 
     def _bend(self, command: Array) -> Array:
         """Offset of the resting pose from the default pose, canonical, shape (n,)."""
         if self._legs is None:
             return np.zeros_like(self._default)
-        return self._legs.advance(command, self._foot_phases(command), self.contract.gait_frequency)
+        return self._legs.advance(command, self._foot_phases(command), self.robot.gait_frequency)
 
     def observe(self, reading: Reading, command: Array) -> dict[str, Array]:
         """Inputs of the network; pushes the reading into the history."""

@@ -8,6 +8,9 @@ from datetime import timedelta
 from typing import Any, Literal, TypeVar
 
 import torch
+from typing_extensions import Self
+
+from eagle_rl.errors import Interrupted
 
 T = TypeVar("T")
 
@@ -46,6 +49,19 @@ class Team:
         if self.size > 1:
             join_processes(device)
             self._group = torch.distributed.new_group(backend="gloo", timeout=PATIENCE)
+
+    def __enter__(self) -> Self:
+        """The team itself."""
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """Part together: a process that dies with its connections open aborts, or breaks off what others still say.
+
+        After a fault there is nobody to wait for.
+        """
+        if self.size > 1 and (kind is None or issubclass(kind, Interrupted)):
+            torch.distributed.barrier(self._group)
+            torch.distributed.destroy_process_group()
 
     @property
     def leads(self) -> bool:

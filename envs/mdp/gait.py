@@ -17,18 +17,18 @@ STANDING_PHASE = 0.25
 """Phase of both feet while standing: the middle of stance, so that C = 1 and the clock reads (1, 1) (HugWBC 1)."""
 
 
-def advance_phase(phase: Tensor, step_dt: float, cfg: GaitCfg) -> Tensor:
+def advance_phase(phase: Tensor, step_dt: float, frequency: Tensor) -> Tensor:
     """Base phase one control step later, ``(phi + f dt) mod 1`` (paper, Eq. clock).
 
     Args:
         phase: base phase [cycles], shape (N,).
         step_dt: control step [s].
-        cfg: gait frequency.
+        frequency: of each robot's gait [Hz], shape (N,).
 
     Returns:
         Shape (N,), in [0, 1).
     """
-    return torch.remainder(phase + cfg.frequency * step_dt, 1.0)
+    return torch.remainder(phase + frequency * step_dt, 1.0)
 
 
 def foot_phases(phase: Tensor, standing: Tensor, cfg: GaitCfg) -> Tensor:
@@ -97,21 +97,22 @@ def swing_target(foot_phase: Tensor, swing_height: Tensor, cfg: GaitCfg) -> Tens
     return swing_height.unsqueeze(1) * rise**3 * (10.0 + rise * (6.0 * rise - 15.0))
 
 
-def stride(foot_phase: Tensor, cfg: GaitCfg) -> Tensor:
+def stride(foot_phase: Tensor, frequency: Tensor, cfg: GaitCfg) -> Tensor:
     """For how long at the commanded velocity each foot is ahead of its middle position (ours).
 
     In stance it falls at unit rate from half the time of stance to minus that; in swing it comes back as a cosine.
 
     Args:
         foot_phase: phase of each foot [cycles], shape (N, 2).
-        cfg: stance ratio and frequency.
+        frequency: of each robot's gait [Hz], shape (N,).
+        cfg: stance ratio.
 
     Returns:
         Time [s], shape (N, 2); zero in the middle of stance, and so while standing.
     """
     phase = homogenise(foot_phase, cfg.stance_ratio)
     share = torch.where(phase < 0.5, 0.5 - 2.0 * phase, 0.5 * torch.cos(2.0 * math.pi * phase))
-    return cfg.stance_ratio / cfg.frequency * share
+    return cfg.stance_ratio / frequency.unsqueeze(1) * share
 
 
 def clock(foot_phase: Tensor) -> Tensor:

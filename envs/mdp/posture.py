@@ -101,7 +101,8 @@ class BentPose:
         """Start in the default pose; see :func:`make_posture`."""
         default = robots.default_joint_pos
         self._default, self._robot, self._swing_height = default, robots.robot_id, robots.swing_height
-        self._gait, self._share, self._gait_share = gait, cfg.posture_reference, cfg.gait_reference
+        self._gait, self._frequency = gait, robots.gait_frequency
+        self._share, self._gait_share = cfg.posture_reference, cfg.gait_reference
         self._left_over = left_over(cfg, step_dt)
         self._nodes = default.new_tensor(HEIGHTS), default.new_tensor(PITCHES)
         self._slots = torch.tensor(LEG_SLOTS, device=default.device).flatten()
@@ -118,7 +119,9 @@ class BentPose:
             return self._default.index_add(1, self._slots, self._look_up(self._bends, height, pitch).repeat(1, 2))
         lift = self._gait_share * swing_target(foot_phase, self._swing_height, self._gait)
         bends = torch.stack([self._look_up(self._bends, height - lift[:, foot], pitch) for foot in range(2)], dim=1)
-        moved = self._gait_share * stride(foot_phase, self._gait).unsqueeze(2) * self.followed[:, None, :3]
+        moved = (
+            self._gait_share * stride(foot_phase, self._frequency, self._gait).unsqueeze(2) * self.followed[:, None, :3]
+        )
         strides = self._look_up(self._strides, height, pitch).unflatten(1, (2, 3, -1))
         legs = bends + (moved.unsqueeze(3) * strides).sum(dim=2)
         return self._default.index_add(1, self._slots, legs.flatten(1))

@@ -48,6 +48,19 @@ def posture_table(spec: RobotSpec) -> Array:
     return table
 
 
+@cache
+def leg_length(spec: RobotSpec) -> float:
+    """From the axis of hip pitch over those of knee and ankle pitch down to the sole, seen from the side [m]."""
+    model = pinocchio_model(spec)
+    data = model.createData()
+    pinocchio.framesForwardKinematics(model, data, pinocchio.neutral(model))
+    names = [spec.joint_names[spec.slots.tolist().index(slot)] for slot in POSTURE_SLOTS[0]]
+    hip, knee, ankle = (data.oMi[model.getJointId(name)].translation for name in names)
+    foot = data.oMf[model.getFrameId(spec.link_roles["left_foot"], pinocchio.FrameType.BODY)]
+    thigh, shank = (float(np.hypot(*(upper - lower)[[0, 2]])) for upper, lower in ((hip, knee), (knee, ankle)))
+    return thigh + shank + float(ankle[2] - foot.act(spec.sole_offsets[0])[2])
+
+
 class _Legs:
     """Kinematics of a robot whose legs bend together."""
 

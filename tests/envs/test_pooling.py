@@ -6,9 +6,10 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eagle_rl.config.schema import ControlCfg, RewardsCfg
+from eagle_rl.config.schema import ControlCfg, GaitCfg, TaskCfg
 from eagle_rl.errors import ConfigError
-from envs.pooling import action_scale, pool_robots, share, soft_limits
+from envs.pooling import REFERENCE_LEG, action_scale, gait_frequency, pool_robots, share, soft_limits
+from envs.robots.posture import leg_length
 from envs.robots.slots import MIRROR_PERMUTATION, MIRROR_SIGN, SLOT_INDEX
 from tests.envs.worlds import robot
 
@@ -60,7 +61,7 @@ def test_soft_limits_shrink_the_canonical_range_about_its_middle(name: str) -> N
 
 def test_every_environment_has_the_constants_of_its_robot() -> None:
     specs = [robot("h1"), robot("t1")]
-    robots = pool_robots(specs, [2, 1], ControlCfg(), RewardsCfg(), torch.device("cpu"), torch.float64)
+    robots = pool_robots(specs, [2, 1], TaskCfg(), torch.device("cpu"), torch.float64)
     assert robots.robot_id.tolist() == [0, 0, 1]
     for row, spec in enumerate([specs[0], specs[0], specs[1]]):
         assert robots.total_mass[row] == spec.total_mass
@@ -69,3 +70,20 @@ def test_every_environment_has_the_constants_of_its_robot() -> None:
         assert np.allclose(spec.to_native(robots.default_joint_pos[row].numpy()), spec.default_joint_pos)
         mirrored = robots.default_joint_pos[row].numpy()[MIRROR_PERMUTATION] * MIRROR_SIGN
         assert np.allclose(robots.default_joint_pos[row].numpy(), mirrored), "the default pose is symmetric"
+
+
+LEGS = {"h1": 0.87, "g1": 0.689, "t1": 0.572, "n1": 0.632, "adam": 0.895}
+"""Thigh, shank and foot seen from the side, added up by hand from the vendors' joint origins and soles [m]."""
+
+
+@pytest.mark.parametrize("name", LEGS)
+def test_a_leg_is_as_long_as_its_links(name):
+    assert leg_length(robot(name)) == pytest.approx(LEGS[name], abs=1e-3)
+
+
+@pytest.mark.parametrize("name", LEGS)
+def test_short_legs_step_quicker_at_an_equal_froude_number(name):
+    spec = robot(name)
+    assert gait_frequency(spec, GaitCfg(frequency=2.0)) == 2.0, "without scaling there is one clock for all"
+    scaled = gait_frequency(spec, GaitCfg(frequency=2.0, leg_scaling=0.5))
+    assert scaled**2 * leg_length(spec) == pytest.approx(2.0**2 * REFERENCE_LEG), "f^2 L / g differs between robots"

@@ -32,7 +32,9 @@ ROBOTS = ("h1", "n1")
 CFG = ExperimentCfg(
     name="untrained",
     robots=ROBOTS,
-    task=TaskCfg(control=ControlCfg(posture_reference=0.8, gait_reference=0.7), gait=GaitCfg(frequency=2.0)),
+    task=TaskCfg(
+        control=ControlCfg(posture_reference=0.8, gait_reference=0.7), gait=GaitCfg(frequency=2.0, leg_scaling=0.5)
+    ),
 )
 SCRIPT = parse_commands("- {t: 0}\n- {t: 1, vx: 0.5, wz: 0.3}\n- {t: 2, h: -0.2, p: 0.3, vy: -0.2}")
 
@@ -96,7 +98,7 @@ def test_a_changed_contract_is_refused(exported, tmp_path):
     model = onnx.load(exported[1])
     for entry in model.metadata_props:
         if entry.key == METADATA_KEY:
-            entry.value = entry.value.replace('"gait_frequency": 2.0', '"gait_frequency": 2.5')
+            entry.value = entry.value.replace('"gait_phase_offset": 0.5', '"gait_phase_offset": 0.4')
     onnx.save(model, tmp_path / "p.onnx")
     with pytest.raises(CheckpointError, match="sha256"):
         OnnxPolicy(tmp_path / "p.onnx", "h1")

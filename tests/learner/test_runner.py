@@ -293,12 +293,14 @@ def test_progress_draws_a_bar_on_a_terminal(capsys):
 PROCESS = """
 import sys, torch
 from pathlib import Path
+from eagle_rl.runners.team import Team
 from tests.learner.helpers import make_runner, parameters
 from tests.toy import ToyEnv
 rank = int(sys.argv[2])
-runner = make_runner(Path(sys.argv[1]), ToyEnv(12, seed=rank))
-runner.learn(2)
-torch.save(parameters(runner), f"{sys.argv[1]}/rank{rank}.pt")
+with Team():
+    runner = make_runner(Path(sys.argv[1]), ToyEnv(12, seed=rank))
+    runner.learn(2)
+    torch.save(parameters(runner), f"{sys.argv[1]}/rank{rank}.pt")
 """
 
 

@@ -11,7 +11,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eagle_rl.config.schema import ControlCfg, GaitCfg, RewardsCfg, SimCfg
+from eagle_rl.config.schema import ControlCfg, GaitCfg, SimCfg, TaskCfg
 from eagle_rl.export import stepping
 from envs.mdp.posture import BentPose, DefaultPose, cell, make_posture
 from envs.pooling import pool_robots
@@ -22,7 +22,7 @@ from envs.robots.spec import FEET
 
 DT = 0.02
 SPECS = [load_robot("h1"), load_robot("n1")]
-ROBOTS = pool_robots(SPECS, [2, 1], ControlCfg(), RewardsCfg(), torch.device("cpu"), torch.float64)
+ROBOTS = pool_robots(SPECS, [2, 1], TaskCfg(), torch.device("cpu"), torch.float64)
 DEFAULT = ROBOTS.default_joint_pos
 NODES = torch.tensor(PITCHES, dtype=torch.float64)
 STANDING = torch.full((3, 2), 0.25, dtype=torch.float64)
@@ -117,7 +117,7 @@ def soles(spec, pose, velocity, time):
 
 def stepping_pose(spec, command, phases):
     """Resting pose, canonical [rad] (32,), of a robot that follows a command without lag, at phases (left, right)."""
-    robots = pool_robots([spec], [1], ControlCfg(), RewardsCfg(), torch.device("cpu"), torch.float64)
+    robots = pool_robots([spec], [1], TaskCfg(), torch.device("cpu"), torch.float64)
     cfg = ControlCfg(posture_reference=1.0, gait_reference=1.0, posture_time_constant=1e-6)
     pose = make_posture(cfg, GaitCfg(), [spec], robots, DT)
     return pose.advance(torch.tensor([command]).double(), torch.tensor([phases]).double())[0].numpy()
@@ -151,9 +151,7 @@ def test_who_stands_does_not_step():
     standing = stepping_pose(ALL[1], [0.0, 0.0, 0.0, -0.1, 0.2], [0.25, 0.25])
     bent = posture_table(ALL[1])[list(HEIGHTS).index(min(HEIGHTS, key=lambda h: abs(h + 0.1)))]
     pitch = int(np.argmin(np.abs(np.array(PITCHES) - 0.2)))
-    default = pool_robots(
-        [ALL[1]], [1], ControlCfg(), RewardsCfg(), torch.device("cpu"), torch.float64
-    ).default_joint_pos[0]
+    default = pool_robots([ALL[1]], [1], TaskCfg(), torch.device("cpu"), torch.float64).default_joint_pos[0]
     moved = standing - default.numpy()
     for side in POSTURE_SLOTS:
         np.testing.assert_allclose(moved[list(side)], bent[pitch], atol=1e-9)
