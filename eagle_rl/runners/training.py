@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +19,7 @@ from eagle_rl.evaluation.evaluate import MakeEnv, Policy
 from eagle_rl.models import EagleActor
 from eagle_rl.runners.checkpoint import latest_checkpoint, load_actor, read_manifest, verify_checkpoint
 from eagle_rl.runners.compass import DemonstrationEnv, ResidualBank, ResidualEnv, ResidualPolicy, begin_residual
+from eagle_rl.runners.files import write_atomically
 from eagle_rl.runners.locate import find_checkpoint
 from eagle_rl.runners.on_policy import EagleRunner, make_train_cfg
 from eagle_rl.runners.plan import Stage, warm_task
@@ -127,10 +127,12 @@ def _copy_root(job: Job, checkpoints: Path) -> Path:
     if source.suffix == SUFFIX:
         raise CheckpointError(f"plan.root: {source}: a published policy has no critic to go on from; use a checkpoint.")
     manifest = verify_checkpoint(source)
-    _tell_changed_meaning(source, manifest["config"], job.cfg)
+    if job.rank == 0:
+        _tell_changed_meaning(source, manifest["config"], job.cfg)
     checkpoints.mkdir(parents=True, exist_ok=True)
-    for suffix in (".pt", ".json"):  # the manifest last: what has one is complete
-        shutil.copyfile(source.with_suffix(suffix), checkpoints / source.with_suffix(suffix).name)
+    for suffix in (".pt", ".json"):  # the manifest last: what has one is complete; whole, for all processes copy it
+        path = source.with_suffix(suffix)
+        write_atomically(checkpoints / path.name, path.read_bytes())
     return checkpoints / source.name
 
 
