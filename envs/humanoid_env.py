@@ -120,7 +120,7 @@ class HumanoidEnv(VecEnv):
         observations = task.observations
         points = scan_points(observations).to(self.device, dtype)
         robot_id = self.robots.robot_id
-        self.posture = make_posture(task.control, task.gait, robots, self.robots, self.step_dt)
+        self.posture = make_posture(task.control, robots, self.robots, self.step_dt)
         self.ground = make_ground(terrain, points, robot_id, self.rng, self.step_dt, self.max_episode_length)
         self.embodiment = (
             pooled_embodiment(robots, robot_id, self.randomizer.bodies, observations.descriptor)
@@ -260,9 +260,7 @@ class HumanoidEnv(VecEnv):
         sound = actions.abs() <= MAX_ACTION
         self._last_last_actions, self._last_actions = self._last_actions, self._actions
         self._actions = torch.where(live & sound, actions.to(self._actions.dtype).clamp(-clip, clip), 0.0)
-        soon = advance_phase(self.phase, self.step_dt, self.robots.gait_frequency)
-        rest = self.posture.advance(self.command, foot_phases(soon, self.commands.standing, self.task.gait))
-        targets = rest + self.robots.action_scale * self._actions
+        targets = self.posture.advance(self.command) + self.robots.action_scale * self._actions
         absurd = (live & ~sound).any(dim=1, keepdim=True)
         return (targets + self.randomizer.motor_offset).masked_fill(absurd, torch.nan)
 

@@ -14,7 +14,7 @@ from .policy import load_policy
 
 if TYPE_CHECKING:
     from eagle_rl.config.schema import ExperimentCfg, TaskCfg
-    from eagle_rl.export.contract import Contract, Legs, Posture, RobotContract, Term
+    from eagle_rl.export.contract import Contract, Posture, RobotContract, Term
     from envs.mdp.layout import ObservationTerm
     from envs.robots.spec import Array, RobotSpec
 
@@ -64,7 +64,7 @@ def build_contract(cfg: ExperimentCfg, checkpoint: str, robots: Sequence[str]) -
         action_clip=task.control.action_clip,
         gait_phase_offset=task.gait.phase_offset,
         standing_phase=STANDING_PHASE,
-        posture=_posture(cfg.task) if _bends(cfg.task) else None,
+        posture=_posture(task) if task.control.posture_reference else None,
         robots={spec.name: _robot(spec, cfg) for spec in map(load_robot, robots)},
     )
 
@@ -85,33 +85,14 @@ def _posture(task: TaskCfg) -> Posture:
         heights=HEIGHTS,
         pitches=PITCHES,
         share=task.control.posture_reference,
-        gait_share=task.control.gait_reference,
-        stance_ratio=task.gait.stance_ratio,
         left_over=left_over(task.control, step_dt),
-    )
-
-
-def _bends(task: TaskCfg) -> bool:
-    """Whether the resting pose follows the command."""
-    return task.control.posture_reference > 0 or task.control.gait_reference > 0
-
-
-def _legs(spec: RobotSpec) -> Legs:
-    from eagle_rl.export.contract import Legs
-    from envs.robots.stride import bend_table, leg_joints, stride_table
-
-    present, joints = leg_joints(spec)
-    return Legs(
-        joints=joints,
-        bends=tuple(bend_table(spec)[..., present].ravel().tolist()),
-        strides=tuple(stride_table(spec)[..., present].ravel().tolist()),
-        swing_height=spec.swing_height,
     )
 
 
 def _robot(spec: RobotSpec, cfg: ExperimentCfg) -> RobotContract:
     from eagle_rl.export.contract import RobotContract
     from envs.pooling import action_scale, gait_frequency
+    from envs.robots.posture import joint_offsets
 
     def numbers(values: Array) -> tuple[float, ...]:
         return tuple(values.tolist())
@@ -128,7 +109,7 @@ def _robot(spec: RobotSpec, cfg: ExperimentCfg) -> RobotContract:
         effort_limit=numbers(spec.effort_limit),
         nominal_height=spec.nominal_height,
         gait_frequency=gait_frequency(spec, cfg.task.gait),
-        legs=_legs(spec) if _bends(cfg.task) else None,
+        posture_offsets=numbers(joint_offsets(spec).ravel()) if cfg.task.control.posture_reference else (),
     )
 
 

@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 
 T = TypeVar("T", bound="DataclassInstance")
 
+RETIRED = {"task.control.gait_reference": 0.0}
+"""Keys of earlier versions and the value that meant off: stored configurations that say just that still load."""
+
 _WORDS: dict[Any, str] = {bool: "true or false", int: "an integer", float: "a number", str: "text"}
 _PLURALS: dict[Any, str] = {int: "integers", float: "numbers", str: "names such as [h1, g1]"}
 
@@ -125,6 +128,8 @@ def build(default: T, node: Node, faults: list[str], prefix: str = "") -> T:
     values: dict[str, Any] = {}
     for key, child in node.children.items():
         path = prefix + key
+        if path in RETIRED and to_plain(child) == RETIRED[path]:
+            continue
         if key not in fields:
             faults.append(f"{child.where}: {_unknown(path, key, list(fields))}")
         elif not dataclasses.is_dataclass(fields[key]):

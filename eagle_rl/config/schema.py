@@ -71,10 +71,6 @@ class ControlCfg:
     posture_reference: float = 0.0
     """Share of the commanded height and pitch to which the targets' resting pose bends by itself, so that the policy
     need not learn the kinematics of a squat [-]; 0 rests in the default pose (ours)."""
-    gait_reference: float = 0.0
-    """Share of the commanded velocities at which the legs of that pose step by themselves with the gait clock: the foot
-    in stance moves as the ground does under the base, the other one is lifted and comes back, so that the policy need
-    not learn the kinematics of walking [-]; 0 keeps both legs in the posture (ours)."""
     posture_time_constant: float = 0.5
     """Lag with which that pose follows the command [s] (ours)."""
 

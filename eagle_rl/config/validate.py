@@ -55,7 +55,7 @@ BOUNDS |= dict.fromkeys(
     task.commands.curriculum.contact_force_threshold task.commands.curriculum.contact_vel_threshold
     task.gait.phase_offset task.gait.leg_scaling task.aids.harness_decay task.aids.gait_shaping_decay
     task.aids.min_episode_ratio task.aids.min_contact_match task.aids.harness_contact_match task.control.upper_ratio
-    task.control.waist_ratio task.control.posture_reference task.control.gait_reference
+    task.control.waist_ratio task.control.posture_reference
     algo.lam plan.tolerance
     """.split(),
     _SHARE,

@@ -9,7 +9,9 @@ Canonical angles are ``sign * (q - zero_offset)``; slot arrays hold zero where a
    ahead by ``gait_phase_offset``; both are ``standing_phase`` while the three velocity commands are zero.
 4. ``slot_mask``: 1 in the robot's slots.
 5. PD targets: resting pose + ``action_scale`` * action, both canonical; actions bounded by ``action_clip``. The
-   resting pose is the default one or, where there is a ``posture``, that plus what ``stepping.py`` works out from it.
+   resting pose is the default one or, where there is a ``posture``, that plus ``posture_offsets``, interpolated
+   linearly between its nodes at ``posture.share`` of a height and pitch that follow the command: each step
+   ``1 - posture.left_over`` of the way, from zero at the start. Beyond the ends the last node holds.
 """
 
 from __future__ import annotations
@@ -40,21 +42,6 @@ class Term:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Legs:
-    """How one robot's legs bend and step; the last index of arrays changes fastest."""
-
-    joints: tuple[tuple[int, ...], ...]
-    """Which of the robot's joints are the left and the right leg's, k each."""
-    bends: Numbers
-    """Canonical offsets [rad] at the nodes of ``posture``: height, pitch, joint; the same for both legs."""
-    strides: Numbers
-    """Canonical offsets at those nodes per unit a foot goes ahead, aside [rad/m] and round [rad/rad]: leg, height,
-    pitch, direction, joint."""
-    swing_height: float
-    """[m]"""
-
-
-@dataclass(frozen=True, kw_only=True)
 class RobotContract:
     """One robot; arrays are in the order of ``joints``, angles native [rad]."""
 
@@ -75,13 +62,14 @@ class RobotContract:
     """Base height at height command zero [m]."""
     gait_frequency: float
     """[Hz]"""
-    legs: Legs | None = None
-    """None where the resting pose is the default pose."""
+    posture_offsets: Numbers
+    """Canonical offsets [rad] at the nodes of ``posture``: height, pitch, joint, the last changing fastest; empty where
+    the resting pose is the default pose."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Posture:
-    """How the resting pose follows the command."""
+    """How the resting pose follows the commanded height and pitch."""
 
     heights: Numbers
     """Nodes, evenly spaced [m]."""
@@ -89,10 +77,6 @@ class Posture:
     """Nodes, evenly spaced [rad]."""
     share: float
     """Of the commanded height and pitch that the pose takes over [-]."""
-    gait_share: float
-    """Of the commanded velocities at which the legs step [-]."""
-    stance_ratio: float
-    """Share of the cycle a foot is in stance [-]."""
     left_over: float
     """Share of the way to the command that is left after a control step [-]."""
 
@@ -147,7 +131,7 @@ class Contract:
             found = values.pop("format")
             if found != FORMAT:
                 raise CheckpointError(f"{source}: contract of format {found}, expected {FORMAT}. Export it again.")
-            robots = {name: _robot(robot) for name, robot in values.pop("robots").items()}
+            robots = {name: RobotContract(**_tuples(robot)) for name, robot in values.pop("robots").items()}
             frame = tuple(Term(**_tuples(term)) for term in values.pop("frame"))
             command = Term(**_tuples(values.pop("command")))
             nodes = values.pop("posture")
@@ -157,13 +141,6 @@ class Contract:
             raise
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise CheckpointError(f"{source}: its contract is damaged ({error}). Export the policy again.") from error
-
-
-def _robot(values: dict[str, Any]) -> RobotContract:
-    legs = values.pop("legs")
-    if legs is not None:
-        legs = Legs(joints=tuple(map(tuple, legs.pop("joints"))), **_tuples(legs))
-    return RobotContract(legs=legs, **_tuples(values))
 
 
 def _tuples(values: dict[str, Any]) -> dict[str, Any]:

@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike, NDArray
 from eagle_rl.errors import CheckpointError, RobotError, did_you_mean
 
 from .contract import DIGEST_KEY, METADATA_KEY, Contract
-from .stepping import RestingLegs
 
 Array = NDArray[np.float64]
 
@@ -85,14 +84,14 @@ class OnnxPolicy:
         self._signs, self._default, self._action_scale = (
             np.array(x) for x in (self.robot.signs, self.robot.default_joint_pos, self.robot.action_scale)
         )
+        self._posture_offsets = np.array(self.robot.posture_offsets).reshape(-1, len(self._slots))
         self.reset()
 
     def reset(self) -> None:
         """Begin anew: no history, no last action, gait phase zero."""
         self.action = np.zeros_like(self._mask)
         self._phase = 0.0
-        posture, legs = self.contract.posture, self.robot.legs
-        self._legs = RestingLegs(posture, legs, len(self._slots)) if posture is not None and legs is not None else None
+        self._followed = np.zeros(2)
         self._frames: Array | None = None
 
     def step(self, reading: Reading, command: ArrayLike) -> Array:
@@ -115,9 +114,13 @@ class OnnxPolicy:
 
     def _bend(self, command: Array) -> Array:
         """Offset of the resting pose from the default pose, canonical, shape (n,)."""
-        if self._legs is None:
+        posture = self.contract.posture
+        if posture is None:
             return np.zeros_like(self._default)
-        return self._legs.advance(command, self._foot_phases(command), self.robot.gait_frequency)
+        self._followed = command[3:] + posture.left_over * (self._followed - command[3:])
+        height, pitch = posture.share * self._followed
+        heights, pitches = hat_weights(height, np.array(posture.heights)), hat_weights(pitch, np.array(posture.pitches))
+        return np.asarray(np.outer(heights, pitches).ravel() @ self._posture_offsets)
 
     def observe(self, reading: Reading, command: Array) -> dict[str, Array]:
         """Inputs of the network; pushes the reading into the history."""
@@ -130,7 +133,7 @@ class OnnxPolicy:
         return {
             "history": self._frames.ravel(),
             "command": np.clip(np.array(self.contract.command.scale) * command, -bound, bound),
-            "clock": np.sin(2.0 * np.pi * self._foot_phases(command)),
+            "clock": self._clock(command),
             "slot_mask": self._mask,
         }
 
@@ -151,14 +154,19 @@ class OnnxPolicy:
         out[self._slots] = native
         return out
 
-    def _foot_phases(self, command: Array) -> Array:
-        """Phase of (left, right) [cycles]."""
-        if not command[:3].any():
-            return np.full(2, self.contract.standing_phase)
-        return np.array([self._phase + self.contract.gait_phase_offset, self._phase])
+    def _clock(self, command: Array) -> Array:
+        standing = not command[:3].any()
+        phases = np.array([self._phase + self.contract.gait_phase_offset, self._phase])
+        return np.sin(2.0 * np.pi * (np.full(2, self.contract.standing_phase) if standing else phases))
 
 
 def projected_gravity(quat: Array) -> Array:
     """Direction of gravity in a frame of orientation (w, x, y, z), shape (3,)."""
     w, x, y, z = quat / np.linalg.norm(quat)
     return np.array([2.0 * (w * y - x * z), -2.0 * (w * x + y * z), 2.0 * (x * x + y * y) - 1.0])
+
+
+def hat_weights(x: float, nodes: Array) -> Array:
+    """Weights (n,) of linear interpolation between evenly spaced nodes (n,); beyond the ends the last one holds."""
+    distance = np.abs(np.clip(x, nodes[0], nodes[-1]) - nodes) / (nodes[1] - nodes[0])
+    return np.asarray(np.maximum(0.0, 1.0 - distance))

@@ -97,24 +97,6 @@ def swing_target(foot_phase: Tensor, swing_height: Tensor, cfg: GaitCfg) -> Tens
     return swing_height.unsqueeze(1) * rise**3 * (10.0 + rise * (6.0 * rise - 15.0))
 
 
-def stride(foot_phase: Tensor, frequency: Tensor, cfg: GaitCfg) -> Tensor:
-    """For how long at the commanded velocity each foot is ahead of its middle position (ours).
-
-    In stance it falls at unit rate from half the time of stance to minus that; in swing it comes back as a cosine.
-
-    Args:
-        foot_phase: phase of each foot [cycles], shape (N, 2).
-        frequency: of each robot's gait [Hz], shape (N,).
-        cfg: stance ratio.
-
-    Returns:
-        Time [s], shape (N, 2); zero in the middle of stance, and so while standing.
-    """
-    phase = homogenise(foot_phase, cfg.stance_ratio)
-    share = torch.where(phase < 0.5, 0.5 - 2.0 * phase, 0.5 * torch.cos(2.0 * math.pi * phase))
-    return cfg.stance_ratio / frequency.unsqueeze(1) * share
-
-
 def clock(foot_phase: Tensor) -> Tensor:
     """Clock observation ``sin(2 pi phi)`` of (left, right), shape (N, 2) (paper, Eq. clock)."""
     return torch.sin(2.0 * math.pi * foot_phase)

@@ -8,13 +8,13 @@ import numpy as np
 import pinocchio
 
 from .embodiment import pinocchio_model
-from .slots import SLOT_INDEX
+from .slots import NUM_SLOTS, SLOT_INDEX
 from .spec import FEET, Array, RobotSpec
 
 HEIGHTS = tuple(np.linspace(-0.4, 0.0, 9).tolist())
 PITCHES = tuple(np.linspace(-0.3, 0.5, 9).tolist())
-"""Nodes of :func:`posture_table`: height offset [m] and pitch [rad], the finishing ranges of the paper's commands and
-room to lift a foot in the deepest squat."""
+"""Nodes of :func:`posture_table`: height offset [m] and pitch [rad]. They span the finishing ranges of the paper's
+commands, heights 0.1 m more; published policies interpolate between just these, so they stay."""
 
 PITCH_JOINTS = ("hip_pitch", "knee_pitch", "ankle_pitch")
 """What bends, the same on both legs."""
@@ -46,6 +46,14 @@ def posture_table(spec: RobotSpec) -> Array:
             for column in columns:
                 bend = table[row, column] = legs.solve(HEIGHTS[row], PITCHES[column], bend)
     return table
+
+
+def joint_offsets(spec: RobotSpec) -> Array:
+    """:func:`posture_table` spread over the joints in native order, still canonical, (heights, pitches, n) [rad]."""
+    table = posture_table(spec)
+    slots = np.zeros((*table.shape[:2], NUM_SLOTS))
+    slots[..., np.array(POSTURE_SLOTS)] = table[:, :, None, :]
+    return slots[..., spec.slots]
 
 
 @cache

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import re
 from pathlib import Path
 
@@ -11,8 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from eagle_rl.config import validate
+from eagle_rl.config.build import RETIRED
 from eagle_rl.config.compose import known_names
-from eagle_rl.config.load import load_experiment, to_yaml
+from eagle_rl.config.load import experiment_from_plain, load_experiment, to_yaml
 from eagle_rl.config.schema import ExperimentCfg, RewardWeightsCfg
 from eagle_rl.config.validate import leaves
 from eagle_rl.errors import ConfigError, RobotError
@@ -44,6 +46,18 @@ def test_a_resolved_experiment_reads_back_as_itself(name):
     cfg = load_experiment(name)
     again = load_experiment(write(to_yaml(cfg)))
     assert again == cfg
+
+
+@pytest.mark.parametrize(("key", "off"), RETIRED.items())
+def test_a_stored_configuration_with_a_key_of_an_earlier_version_loads_where_that_was_off(key, off):
+    *parents, last = key.split(".")
+
+    def stored(value):
+        return functools.reduce(lambda inner, parent: {parent: inner}, reversed(parents), {last: value})
+
+    assert experiment_from_plain(stored(off), "old") == ExperimentCfg(name="stored")
+    with pytest.raises(ConfigError, match=f"{key}: no such key"):
+        experiment_from_plain(stored(1.0), "old")
 
 
 def test_a_whole_configuration_is_written_down_in_the_resolved_file():

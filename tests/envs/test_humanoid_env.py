@@ -175,7 +175,7 @@ def test_actions_in_absent_slots_change_nothing() -> None:
 @pytest.mark.parametrize("name", ["h1", "g1", "t1"])
 def test_a_robot_does_the_same_alone_and_in_company(name: str) -> None:
     fleet = ["h1", "g1", "t1"]
-    task = replace(TaskCfg(), control=ControlCfg(posture_reference=1.0, gait_reference=1.0))
+    task = replace(TaskCfg(), control=ControlCfg(posture_reference=1.0))
     pooled, alone = make_env(fleet, 9, task), make_env([name], 3, task)
     rows = slice(3 * fleet.index(name), 3 * fleet.index(name) + 3)
     for step in range(60):

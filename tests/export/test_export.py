@@ -32,9 +32,7 @@ ROBOTS = ("h1", "n1")
 CFG = ExperimentCfg(
     name="untrained",
     robots=ROBOTS,
-    task=TaskCfg(
-        control=ControlCfg(posture_reference=0.8, gait_reference=0.7), gait=GaitCfg(frequency=2.0, leg_scaling=0.5)
-    ),
+    task=TaskCfg(control=ControlCfg(posture_reference=0.8), gait=GaitCfg(frequency=2.0, leg_scaling=0.5)),
 )
 SCRIPT = parse_commands("- {t: 0}\n- {t: 1, vx: 0.5, wz: 0.3}\n- {t: 2, h: -0.2, p: 0.3, vy: -0.2}")
 

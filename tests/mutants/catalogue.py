@@ -30,7 +30,6 @@ POOLING = "envs/pooling.py"
 AIDS = "envs/mdp/aids.py"
 POSTURE = "envs/robots/posture.py"
 RESTING = "envs/mdp/posture.py"
-STRIDE = "envs/robots/stride.py"
 LOSSES = "eagle_rl/algorithms/losses.py"
 GAUSSIAN = "eagle_rl/models/distribution.py"
 PPO = "eagle_rl/algorithms/eagle_ppo.py"
@@ -62,13 +61,8 @@ MUTANTS: tuple[Mutant, ...] = (
     Mutant(POSTURE, "signs[self._index] * bend", "signs[self._index] * -bend", "robots/test_posture.py"),
     Mutant(POSTURE, "(0.0, np.sin(pitch / 2)", "(0.0, -np.sin(pitch / 2)", "robots/test_posture.py"),
     Mutant(POSTURE, "bend + step, self._lower, self._upper", "bend + step, -9, 9", "robots/test_posture.py"),
-    Mutant(RESTING, "(self._share * self.followed[:, 3:])", "(self.followed[:, 3:])", "mdp/test_posture.py"),
-    Mutant(RESTING, "height - lift[:, foot]", "height + lift[:, foot]", "mdp/test_posture.py"),
-    Mutant(STRIDE, "wanted[:2, 2] = -sole[1], sole[0]", "wanted[:2, 2] = sole[1], -sole[0]", "mdp/test_posture.py"),
-    Mutant(STRIDE, "np.cross(jacobian[3:].T, sole)", "np.cross(sole, jacobian[3:].T)", "mdp/test_posture.py"),
-    Mutant(STRIDE, "[left, _MIRROR * left]", "[left, left]", "envs/test_mirrored_dynamics.py"),
-    Mutant(GAIT, "0.5 - 2.0 * phase", "2.0 * phase - 0.5", "mdp/test_posture.py"),
-    Mutant("eagle_rl/export/stepping.py", "0.5 - 2.0 * cycle", "2.0 * cycle - 0.5", "export/test_export.py"),
+    Mutant(RESTING, "(self._share * self.followed)", "(self.followed)", "mdp/test_posture.py"),
+    Mutant("eagle_rl/export/runtime.py", "posture.share * self._followed", "self._followed", "export/test_export.py"),
     Mutant(RESTING, "-step_dt / cfg.posture_time_constant", "-cfg.posture_time_constant", "mdp/test_posture.py"),
     Mutant(
         "envs/mdp/curriculum.py", "penalty_exponent**updates", "penalty_exponent * updates", "mdp/test_curriculum.py"

@@ -11,10 +11,9 @@ import pytest
 from eagle_rl.config.schema import SimCfg
 from envs.robots.load import load_robot
 from envs.robots.model import build_model
-from envs.robots.posture import HEIGHTS, PITCHES, POSTURE_SLOTS, posture_table
+from envs.robots.posture import HEIGHTS, PITCH_JOINTS, PITCHES, POSTURE_SLOTS, joint_offsets, posture_table
 from envs.robots.slots import NUM_SLOTS
 from envs.robots.spec import FEET
-from envs.robots.stride import bend_table, leg_joints
 
 ROBOTS = ("h1", "g1", "t1", "n1", "adam")
 WITHIN_REACH = [(h, p) for h in (-0.1, 0.0) for p in (0.0, 0.2, 0.4)]
@@ -83,8 +82,18 @@ def test_where_joints_end_height_is_given_up_before_flat_soles(robot):
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_no_pose_is_beyond_a_joint_limit(robot):
     spec = load_robot(robot)
-    present, legs = leg_joints(spec)
-    for leg in map(list, legs):
-        angles = spec.default_joint_pos[leg] + spec.signs[leg] * bend_table(spec)[..., present]
-        assert (angles >= spec.joint_lower[leg] - 1e-9).all(), f"{robot}: {[spec.joint_names[i] for i in leg]}"
-        assert (angles <= spec.joint_upper[leg] + 1e-9).all(), f"{robot}: {[spec.joint_names[i] for i in leg]}"
+    angles = spec.default_joint_pos + spec.signs * joint_offsets(spec)
+    assert (angles >= spec.joint_lower - 1e-9).all(), f"{robot}: {spec.joint_names}"
+    assert (angles <= spec.joint_upper + 1e-9).all(), f"{robot}: {spec.joint_names}"
+
+
+def test_both_legs_bend_alike_and_nothing_else_moves():
+    spec = load_robot("t1")
+    offsets, table = joint_offsets(spec), posture_table(spec)
+    slots = spec.slots.tolist()
+    for side in POSTURE_SLOTS:
+        for joint, slot in enumerate(side):
+            moved = offsets[..., slots.index(slot)]
+            np.testing.assert_array_equal(moved, table[..., joint], err_msg=PITCH_JOINTS[joint])
+    others = [i for i, slot in enumerate(slots) if slot not in np.ravel(POSTURE_SLOTS)]
+    assert not offsets[..., others].any()
