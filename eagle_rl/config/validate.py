@@ -73,6 +73,7 @@ CEILINGS: dict[str, float] = {
     "num_envs": 1e6,
     "evaluation.num_envs_per_robot": 1e6,
     "plan.judge_envs_per_robot": 1e6,
+    "plan.specialist_num_envs": 1e6,
     "evaluation.num_steps": 1e6,
     "task.observations.history_length": 1e3,
     "task.terrain.num_levels": 1e3,

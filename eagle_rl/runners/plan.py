@@ -16,6 +16,9 @@ from eagle_rl.config.schema import ExperimentCfg, TaskCfg
 Kind = Literal["root", "generalist", "continued", "specialist", "distill", "base", "residual"]
 Imitation = Literal["eagle", "kickstart"]
 
+ALONE: tuple[Kind, ...] = ("specialist", "residual")
+"""What trains one robot."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Stage:
@@ -54,7 +57,7 @@ class Stage:
     @property
     def specialised(self) -> bool:
         """Whether it ends with a policy for one robot, out of a policy for all."""
-        return self.kind in ("specialist", "residual")
+        return self.kind in ALONE
 
 
 def warm_task(task: TaskCfg) -> TaskCfg:
@@ -67,12 +70,18 @@ def warm_task(task: TaskCfg) -> TaskCfg:
     )
 
 
+def stage_num_envs(cfg: ExperimentCfg, kind: Kind) -> int:
+    """Environments of a stage."""
+    return (cfg.plan.specialist_num_envs if kind in ALONE else 0) or cfg.num_envs
+
+
 def _stage(cfg: ExperimentCfg, name: str, kind: Kind, env_steps: int, **rest: object) -> Stage:
     """A stage with its budget in iterations and a seed of its own."""
+    steps = stage_num_envs(cfg, kind) * cfg.algo.num_steps_per_env
     fields = {
         "round": 0,
         "robots": cfg.robots,
-        "iterations": -(-env_steps // (cfg.num_envs * cfg.algo.num_steps_per_env)),
+        "iterations": -(-env_steps // steps),
         "seed": zlib.crc32(f"{cfg.seed}/{name}".encode()) >> 1,
     }
     return Stage(name=name, kind=kind, env_steps=env_steps, **{**fields, **rest})  # type: ignore[arg-type]
@@ -151,8 +160,8 @@ def plan_stages(cfg: ExperimentCfg, processes: int = 1) -> list[Stage]:
 
     With several data-parallel ``processes``, each of which has all of ``num_envs``, budgets take fewer iterations.
     """
-    cfg = replace(cfg, num_envs=cfg.num_envs * processes)
-    plan = cfg.plan
+    plan = replace(cfg.plan, specialist_num_envs=cfg.plan.specialist_num_envs * processes)
+    cfg = replace(cfg, num_envs=cfg.num_envs * processes, plan=plan)
     if plan.root is None:
         stages = [_stage(cfg, "generalist", "generalist", plan.generalist_env_steps)]
     else:

@@ -22,7 +22,7 @@ from eagle_rl.runners.compass import DemonstrationEnv, ResidualBank, ResidualEnv
 from eagle_rl.runners.files import write_atomically
 from eagle_rl.runners.locate import find_checkpoint
 from eagle_rl.runners.on_policy import EagleRunner, make_train_cfg
-from eagle_rl.runners.plan import Stage, warm_task
+from eagle_rl.runners.plan import Stage, stage_num_envs, warm_task
 from eagle_rl.runners.provenance import Provenance, changes
 from eagle_rl.runners.published import SUFFIX
 
@@ -57,7 +57,7 @@ def stage_cfg(cfg: ExperimentCfg, stage: Stage) -> ExperimentCfg:
     algo = cfg.algo
     if stage.demonstrations:
         algo = dataclasses.replace(algo, use_ppo_loss=False, kickstart_coef=1.0, kickstart_decay=0.0)
-    return dataclasses.replace(cfg, robots=stage.robots, task=task, algo=algo)
+    return dataclasses.replace(cfg, robots=stage.robots, num_envs=stage_num_envs(cfg, stage.kind), task=task, algo=algo)
 
 
 def train(job: Job) -> Path:
