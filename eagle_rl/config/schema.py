@@ -430,8 +430,8 @@ class PlanCfg:
     specialist_env_steps: int = 0
     """Budget of each specialist, per round."""
     specialist_num_envs: int = 0
-    """Environments of a specialist; 0 for as many as the pool has: batches of one robot five times what it had there, and
-    a fifth of the iterations (ours)."""
+    """Environments of a specialist; 0 for as many as the pool has: its batches are then so many times larger than one
+    robot's share of the pool, and its iterations fewer (ours)."""
     distill_env_steps: int = 0
     """Budget of each distillation, per round."""
     base_env_steps: int = 0

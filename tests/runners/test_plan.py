@@ -52,6 +52,16 @@ def test_budgets_are_spent_in_whole_iterations_and_never_undershot(steps, envs):
     assert steps <= spent < steps + envs * 24
 
 
+@pytest.mark.parametrize("processes", [1, 2])
+def test_specialists_may_have_fewer_environments_and_take_more_iterations(processes):
+    cfg = ExperimentCfg(name="x", num_envs=100, plan=dataclasses.replace(EAGLE, specialist_env_steps=24 * 400))
+    few = dataclasses.replace(cfg, plan=dataclasses.replace(cfg.plan, specialist_num_envs=20))
+    one, other = ({s.name: s.iterations for s in plan_stages(c, processes)} for c in (cfg, few))
+    assert (one.pop("round1/specialist_g1"), other.pop("round1/specialist_g1")) == (4 // processes, 20 // processes)
+    pooled = [name for name in one if "specialist" not in name]
+    assert [one[name] for name in pooled] == [other[name] for name in pooled], "the pool has the same environments"
+
+
 def test_stages_have_seeds_of_their_own_that_follow_the_runs_seed():
     seeds = [stage.seed for stage in plan()]
     assert len(set(seeds)) == len(seeds)

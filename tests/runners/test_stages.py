@@ -13,8 +13,11 @@ from eagle_rl.errors import CheckpointError, ConfigError, EagleWarning
 from eagle_rl.evaluation.evaluate import EvaluationResult
 from eagle_rl.runners.checkpoint import load_checkpoint
 from eagle_rl.runners.claims import Claim, ClaimLostError
+from eagle_rl.runners.plan import plan_stages
+from eagle_rl.runners.provenance import Provenance
 from eagle_rl.runners.records import read_record, stage_dir
 from eagle_rl.runners.stages import run_experiment
+from eagle_rl.runners.training import Job, train
 from tests.runners.toy_run import ENVS, STEPS, JudgedToyEnv, make_toy_env, parameters, toy_experiment
 
 
@@ -58,16 +61,17 @@ def test_every_stage_is_judged_on_its_own_robots(finished):
 
 
 def test_a_specialist_starts_from_the_generalists_weights(tmp_path):
-    cfg = toy_experiment(iterations=1, judge_envs=0)
-    seen = {}
+    cfg = toy_experiment(iterations=1, judge_envs=0, specialist_num_envs=5)
+    seen, sizes = {}, {}
 
     def watch(robots, num_envs, task, seed, first=0):
-        seen[tuple(robots)] = task
+        seen[tuple(robots)], sizes[tuple(robots)] = task, num_envs
         return make_toy_env(robots, num_envs, task, seed)
 
     run_experiment(cfg, tmp_path / "run", watch)
     assert seen[("one", "two", "three")].aids.harness == 0.0, "distillation is the last pooled stage"
     assert seen[("two",)].aids.harness == 0.0
+    assert (sizes[("one", "two", "three")], sizes[("two",)]) == (ENVS, 5)
     assert not seen[("two",)].commands.curriculum.enabled
 
 
@@ -201,6 +205,31 @@ def test_a_run_can_be_the_root(finished, tmp_path):
     cfg = toy_experiment(iterations=1, judge_envs=0, method="ppo", root=str(finished.run_dir))
     result = run_experiment(cfg, tmp_path / "run", make_toy_env)
     assert result.records["root"].sha256 == finished.records["round1/distill"].sha256
+
+
+def test_who_reads_the_root_while_another_process_copies_it_reads_all_of_it(finished, tmp_path):
+    root = finished.run_dir / finished.records["generalist"].checkpoint
+    cfg = toy_experiment(method="ppo", root=str(root))
+    checkpoints = tmp_path / "checkpoints"
+    checkpoints.mkdir()
+    theirs = checkpoints / root.name
+    shutil.copyfile(root, theirs)
+    job = Job(
+        cfg=cfg,
+        stage=plan_stages(cfg)[0],
+        folder=tmp_path,
+        init=None,
+        teachers=(),
+        base=None,
+        make_env=make_toy_env,
+        provenance=Provenance(),
+        check_claim=lambda: None,
+    )
+    with theirs.open("rb") as reader:
+        inode = theirs.stat().st_ino
+        assert train(job) == theirs
+        assert theirs.stat().st_ino != inode, "copied into the file that another process has open"
+        assert reader.read() == root.read_bytes()
 
 
 def test_the_run_is_complete_without_its_root(finished, tmp_path):
