@@ -70,7 +70,8 @@ class ControlCfg:
     the yaw-rate error H1 has in training)."""
     posture_reference: float = 0.0
     """Share of the commanded height and pitch to which the targets' resting pose bends by itself, so that the policy
-    need not learn the kinematics of a squat [-]; 0 rests in the default pose (ours)."""
+    need not learn the kinematics of a squat [-]; 0 rests in the default pose. Above 1 it bends further than commanded,
+    for walking takes some of it back (ours)."""
     posture_time_constant: float = 0.5
     """Lag with which that pose follows the command [s] (ours)."""
 

@@ -55,7 +55,7 @@ BOUNDS |= dict.fromkeys(
     task.commands.curriculum.contact_force_threshold task.commands.curriculum.contact_vel_threshold
     task.gait.phase_offset task.gait.leg_scaling task.aids.harness_decay task.aids.gait_shaping_decay
     task.aids.min_episode_ratio task.aids.min_contact_match task.aids.harness_contact_match task.control.upper_ratio
-    task.control.waist_ratio task.control.posture_reference
+    task.control.waist_ratio
     algo.lam plan.tolerance
     """.split(),
     _SHARE,
@@ -68,6 +68,7 @@ BOUNDS |= dict.fromkeys(
     _POSITIVE_SHARE,
 )
 BOUNDS["task.gait.stance_ratio"] = _OPEN_SHARE
+BOUNDS["task.control.posture_reference"] = ("from 0 to 1.5", lambda x: 0 <= x <= 1.5)
 
 CEILINGS: dict[str, float] = {
     "num_envs": 1e6,

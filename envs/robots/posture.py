@@ -12,9 +12,9 @@ from .slots import NUM_SLOTS, SLOT_INDEX
 from .spec import FEET, Array, RobotSpec
 
 HEIGHTS = tuple(np.linspace(-0.4, 0.0, 9).tolist())
-PITCHES = tuple(np.linspace(-0.3, 0.5, 9).tolist())
+PITCHES = tuple(np.linspace(-0.4, 0.7, 12).tolist())
 """Nodes of :func:`posture_table`: height offset [m] and pitch [rad]. They span the finishing ranges of the paper's
-commands, heights 0.1 m more; published policies interpolate between just these, so they stay."""
+commands and 0.1 to 0.2 more; published policies interpolate between just these, so they stay."""
 
 PITCH_JOINTS = ("hip_pitch", "knee_pitch", "ankle_pitch")
 """What bends, the same on both legs."""
