@@ -12,7 +12,7 @@ from eagle_rl.config.schema import ControlCfg, GaitCfg, TaskCfg
 from eagle_rl.errors import ConfigError
 
 from .robots.posture import leg_length
-from .robots.slots import HIP_YAW_SLOTS, LEG_PITCH_SLOTS, NUM_SLOTS, UPPER_SLOTS, WAIST_SLOTS
+from .robots.slots import HIP_YAW_SLOTS, LEG_PITCH_SLOTS, NUM_SLOTS, SHOULDER_PITCH_SLOTS, UPPER_SLOTS, WAIST_SLOTS
 from .robots.spec import Array, RobotSpec
 from .state import PooledRobots
 
@@ -39,6 +39,7 @@ def action_scale(spec: RobotSpec, cfg: ControlCfg) -> Array:
     """
     slots = np.arange(NUM_SLOTS)
     bound = np.where(np.isin(slots, LEG_PITCH_SLOTS), cfg.min_effort_ratio_leg_pitch, cfg.min_effort_ratio)
+    bound = np.where(np.isin(slots, SHOULDER_PITCH_SLOTS), cfg.min_effort_ratio_shoulder_pitch, bound)
     extra = np.where(np.isin(slots, HIP_YAW_SLOTS), cfg.hip_yaw_ratio, 1.0)
     extra = np.where(np.isin(slots, UPPER_SLOTS), cfg.upper_ratio, extra)
     extra = np.where(np.isin(slots, WAIST_SLOTS), cfg.waist_ratio, extra)

@@ -61,6 +61,8 @@ class ControlCfg:
     saturated torque)."""
     min_effort_ratio_leg_pitch: float = 0.6
     """The same bound for hip pitch, knee and ankle pitch, which must travel far to squat [-] (ours)."""
+    min_effort_ratio_shoulder_pitch: float = 0.25
+    """The same bound for shoulder pitch: arms that swing hold the pelvis still [-] (ours)."""
     hip_yaw_ratio: float = 0.5
     """Extra factor at hip yaw [-] (ours, from the single-robot study)."""
     upper_ratio: float = 0.5

@@ -62,7 +62,8 @@ BOUNDS |= dict.fromkeys(
 )
 BOUNDS |= dict.fromkeys(
     """
-    task.control.min_effort_ratio task.control.min_effort_ratio_leg_pitch task.rewards.soft_limit_ratio
+    task.control.min_effort_ratio task.control.min_effort_ratio_leg_pitch task.control.min_effort_ratio_shoulder_pitch
+    task.rewards.soft_limit_ratio
     task.rewards.penalty_initial task.rewards.penalty_exponent algo.mirror_fraction algo.gamma
     """.split(),
     _POSITIVE_SHARE,

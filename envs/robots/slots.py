@@ -38,6 +38,7 @@ MIRROR_SIGN = np.array([1.0 if name.endswith("_pitch") else -1.0 for name in SLO
 """Sign under the mirror: pitch keeps it, roll and yaw lose it, shape (32,)."""
 
 LEG_PITCH_SLOTS = tuple(i for i, n in enumerate(SLOT_NAMES) if n.endswith(("hip_pitch", "knee_pitch", "ankle_pitch")))
+SHOULDER_PITCH_SLOTS = tuple(i for i, n in enumerate(SLOT_NAMES) if n.endswith("shoulder_pitch"))
 HIP_YAW_SLOTS = tuple(i for i, n in enumerate(SLOT_NAMES) if n.endswith("hip_yaw"))
 HIP_DEVIATION_SLOTS = tuple(i for i, n in enumerate(SLOT_NAMES) if n.endswith(("hip_roll", "hip_yaw")))
 WAIST_SLOTS = tuple(i for i, n in enumerate(SLOT_NAMES) if n.startswith("waist"))
