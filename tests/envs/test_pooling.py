@@ -30,13 +30,13 @@ def test_shares_are_equal_up_to_a_remainder_on_the_first_robots(num_envs: int, n
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_an_action_of_one_follows_the_effort_rule(name: str) -> None:
-    cfg, spec = ControlCfg(), robot(name)
+    cfg, spec = ControlCfg(min_effort_ratio_shoulder_pitch=0.4), robot(name)
     scale = action_scale(spec, cfg)
     assert not scale[~spec.slot_mask].any(), "absent slots"
     for joint, slot in enumerate(spec.slots):
         role = next(n for n, i in SLOT_INDEX.items() if i == slot)
         leg_pitch = role.endswith(("hip_pitch", "knee_pitch", "ankle_pitch"))
-        bound = 0.6 if leg_pitch else 0.25
+        bound = 0.6 if leg_pitch else 0.4 if role.endswith("shoulder_pitch") else 0.25
         factor = 0.5 if role.endswith("hip_yaw") or slot >= 12 else 1.0
         expected = 0.25 * factor * min(1.0, max(bound, spec.effort_limit[joint] / spec.stiffness[joint]))
         assert scale[slot] == pytest.approx(expected), role
