@@ -138,8 +138,8 @@ class EagleRunner(OnPolicyRunner):
                         self._save_now_and_then()
                     on_iteration(self.current_learning_iteration)
                     if self._any_process(interrupt.requested):
-                        done = self.current_learning_iteration
-                        raise Interrupted(f"Interrupted after iteration {done}, saved as {self.save()}.")
+                        done, saved = self.current_learning_iteration, self.save()
+                        raise Interrupted(f"Interrupted after iteration {done}, saved as {saved or 'rank 0 says'}.")
         except HealthError as error:
             if not self.is_distributed:  # the other processes cannot be asked for their part of the state
                 self._save_before_stopping(error)
