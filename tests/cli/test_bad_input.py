@@ -84,7 +84,7 @@ def test_a_command_typed_into_a_shell_is_refused_within_its_message(tmp_path, wo
 
 
 def test_every_fault_of_a_file_is_in_one_message(refused):
-    text = to_yaml(load_experiment("ppo")).replace("gamma:", "gama:").replace("num_envs: ", "num_envs: many # ")
+    text = to_yaml(load_experiment("ppo")).replace("gamma:", "gama:").replace("\nnum_envs: ", "\nnum_envs: many # ")
     Path("mine.yaml").write_text(text)
     refused(["train", "mine.yaml"], 2, "num_envs: got 'many'", "Did you mean gamma?")
 
