@@ -34,7 +34,6 @@ METHODS = {
     "fork_kickstarting": "Kickstarting",
     "fork_eagle": "EAGLE",
     "fork_eagle_id": "EAGLE w/ ID",
-    "finish": "PPO continued",
 }
 """The paper's name for each of its experiments."""
 
