@@ -70,18 +70,25 @@ class Mirror:
 class Distill:
     """alpha L_a + beta L_e towards the specialists' labels (paper, Eq. 9)."""
 
-    def __init__(self, alpha: float, beta: float, robot_names: Sequence[str]) -> None:
-        """Weigh the action loss with ``alpha`` and the embedding loss with ``beta``."""
+    def __init__(self, alpha: float, beta: float, robot_names: Sequence[str], in_noise_units: bool = False) -> None:
+        """Weigh the action loss with ``alpha`` and the embedding loss with ``beta``.
+
+        ``in_noise_units`` measures actions as multiples of the specialists' noise; the paper's are in units of action.
+        """
         self.alpha, self.beta = alpha, beta
         self.robot_names = robot_names
+        self.in_noise_units = in_noise_units
 
     def __call__(self, actor: EagleActor, obs: TensorDict, log: dict[str, Tensor]) -> Tensor:
         """Weighted loss; logs both terms per robot."""
         mask, mean = obs["slot_mask"], actor.output_mean
-        action = losses.action_loss(mean, obs["teacher_action"], mask)
+        teacher = obs["teacher_action"]
+        if self.in_noise_units:
+            mean, teacher = (losses.in_noise_units(x, obs["teacher_std"], mask) for x in (mean, teacher))
+        action = losses.action_loss(mean, teacher, mask)
         embedding = losses.embedding_loss(actor.embedding, obs["teacher_embedding"])
         with torch.no_grad():
-            action_rows = (mean - obs["teacher_action"]).square().sum(dim=1) / mask.sum(dim=1)
+            action_rows = (mean - teacher).square().sum(dim=1) / mask.sum(dim=1)
             embedding_rows = (actor.embedding - obs["teacher_embedding"]).square().mean(dim=1)
             log |= self._per_robot("Distill/L_a", action_rows, obs["robot"])
             log |= self._per_robot("Distill/L_e", embedding_rows, obs["robot"])

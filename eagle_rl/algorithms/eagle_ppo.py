@@ -112,7 +112,10 @@ class EaglePPO(PPO):
         self.specialists = specialists
         cfg = self.cfg
         if method == "eagle":
-            self.symmetry.terms.append(Distill(cfg.action_loss_coef, cfg.embedding_loss_coef, self.robot_names))
+            in_noise_units = cfg.action_loss_unit == "noise"
+            self.symmetry.terms.append(
+                Distill(cfg.action_loss_coef, cfg.embedding_loss_coef, self.robot_names, in_noise_units)
+            )
         else:
             self.symmetry.terms.append(
                 Kickstart(lambda: cfg.kickstart_coef * math.exp(-cfg.kickstart_decay * self.num_updates))

@@ -23,6 +23,11 @@ def action_loss(mean: Tensor, teacher_mean: Tensor, mask: Tensor) -> Tensor:
     return masked_mse(mean - teacher_mean, mask)
 
 
+def in_noise_units(action: Tensor, teacher_std: Tensor, mask: Tensor) -> Tensor:
+    """Actions or their differences (N, S) as multiples of the specialist's noise, the unit of PPO's own loss."""
+    return action / (teacher_std + 1 - mask)
+
+
 def embedding_loss(embedding: Tensor, teacher_embedding: Tensor) -> Tensor:
     """L_e, paper Eq. 8: (e_g(s_t) - e_s(s_t))^2 on embeddings (N, E)."""
     return (embedding - teacher_embedding).square().mean()

@@ -411,6 +411,8 @@ class AlgoCfg:
     """Off leaves only the imitation losses: pure DAgger (ablation)."""
     action_loss_coef: float = 0.02
     """alpha, weight of L_a in distillation (paper)."""
+    action_loss_unit: Literal["action", "noise"] = "action"
+    """Of actions in L_a: as the policy gives them (paper), or multiples of the specialist's noise (ours)."""
     embedding_loss_coef: float = 1.0
     """beta, weight of L_e in distillation (paper)."""
     kickstart_coef: float = 1.0

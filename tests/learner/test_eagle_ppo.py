@@ -74,7 +74,8 @@ def hand_written_loss(runner: EagleRunner, bank: list[EagleActor]) -> torch.Tens
         with torch.no_grad():
             teacher_mean = teacher(obs[i : i + 1])[0, live]
             teacher_std = teacher.distribution.std_param[live]
-        action.append((mean[i, live] - teacher_mean).square())
+        unit = teacher_std if cfg.action_loss_unit == "noise" else 1.0
+        action.append(((mean[i, live] - teacher_mean) / unit).square())
         embed.append((embedding[i] - teacher.embedding[0]).square())
         kick.append(kl_divergence(Normal(teacher_mean, teacher_std), pi).sum())
     error = (estimate - obs["estimate"]).square()
@@ -90,7 +91,8 @@ def hand_written_loss(runner: EagleRunner, bank: list[EagleActor]) -> torch.Tens
     )
 
 
-def test_the_gradient_of_update_is_that_of_a_hand_written_sum_of_all_losses():
+@pytest.mark.parametrize("unit", ["action", "noise"])
+def test_the_gradient_of_update_is_that_of_a_hand_written_sum_of_all_losses(unit):
     runner = make_runner(
         **ONE_STEP,
         mirror_fraction=1.0,
@@ -98,6 +100,7 @@ def test_the_gradient_of_update_is_that_of_a_hand_written_sum_of_all_losses():
         learning_rate=0.0,
         entropy_coef=0.01,
         action_loss_coef=0.3,
+        action_loss_unit=unit,
         desired_kl=1e3,
     )
     runner.env.mask[::3, 2] = 0.0  # a robot that is not its own mirror image

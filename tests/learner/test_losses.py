@@ -15,6 +15,12 @@ def test_action_loss_is_a_mean_over_live_slots_only():
     assert losses.action_loss(teacher + difference, teacher, MASK).item() == pytest.approx((1 + 4 + 1) / 6, rel=1e-5)
 
 
+def test_an_action_off_by_the_specialists_noise_is_off_by_one():
+    std = torch.tensor([[0.05, 0.4, 0.0, 0.0], [0.1, 0.1, 0.2, 0.3]])  # zero in absent slots, as its label is
+    units = losses.in_noise_units(std, std, MASK)
+    assert torch.allclose(units, MASK), f"expected 1 in live slots and 0 in absent ones, got {units}"
+
+
 def test_embedding_loss_is_a_mean_over_rows_and_dimensions():
     assert losses.embedding_loss(torch.full((3, 8), 2.0), torch.full((3, 8), 0.5)).item() == pytest.approx(2.25)
 
