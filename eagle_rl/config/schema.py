@@ -449,6 +449,9 @@ class PlanCfg:
     root: str | None = None
     """Checkpoint to fork from instead of training a generalist; with method ``ppo`` the generalist's budget is then
     spent on continuing from it."""
+    calibration_envs: int = 0
+    """Environments in which a trained specialist tries gains on its velocity commands and keeps those that help; 0 for
+    none (ours)."""
     judge_envs_per_robot: int = 64
     """Environments per robot in the evaluation that ends each stage and decides on convergence; 0 leaves it out."""
 

@@ -74,6 +74,7 @@ BOUNDS["task.control.posture_reference"] = ("from 0 to 1.5", lambda x: 0 <= x <=
 CEILINGS: dict[str, float] = {
     "num_envs": 1e6,
     "evaluation.num_envs_per_robot": 1e6,
+    "plan.calibration_envs": 1e6,
     "plan.judge_envs_per_robot": 1e6,
     "plan.specialist_num_envs": 1e6,
     "evaluation.num_steps": 1e6,

@@ -104,6 +104,7 @@ class EagleRunner(OnPolicyRunner):
         num_learning_iterations: int,
         init_at_random_ep_len: bool = True,
         on_iteration: Callable[[int], None] = lambda iteration: None,
+        at_end: Callable[[EagleActor], None] = lambda actor: None,
     ) -> Path | None:
         """Train, then save.
 
@@ -113,6 +114,7 @@ class EagleRunner(OnPolicyRunner):
             num_learning_iterations: iterations to add to those done.
             init_at_random_ep_len: spread the ages of the first episodes, so that not all end at once.
             on_iteration: told the number of iterations done after each.
+            at_end: may change the trained policy before it is saved for good.
 
         Returns:
             The final checkpoint; None where nothing is written.
@@ -144,6 +146,8 @@ class EagleRunner(OnPolicyRunner):
             if not self.is_distributed:  # the other processes cannot be asked for their part of the state
                 self._save_before_stopping(error)
             raise
+        at_end(self.alg.actor)
+        self._saved = None
         return self.save(stage_end=True)
 
     def _iterate(self) -> dict[str, float]:
@@ -389,12 +393,8 @@ class EagleRunner(OnPolicyRunner):
         self.cfg["multi_gpu"] = None
         if not self.is_distributed:
             return
-        self.cfg["multi_gpu"] = {
-            "global_rank": self.gpu_global_rank,
-            "local_rank": self.gpu_local_rank,
-            "world_size": self.gpu_world_size,
-        }
-        on_gpu = str(self.device).startswith("cuda")
-        if on_gpu:
+        ranks = ("global_rank", "local_rank", "world_size")
+        self.cfg["multi_gpu"] = {key: getattr(self, f"gpu_{key}") for key in ranks}
+        if str(self.device).startswith("cuda"):
             torch.cuda.set_device(torch.device(self.device).index or 0)
         join_processes(self.device)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +19,18 @@ from eagle_rl.config.schema import ExperimentCfg
 from eagle_rl.errors import CheckpointError
 from eagle_rl.evaluation.evaluate import MakeEnv, Policy
 from eagle_rl.models import EagleActor
+from eagle_rl.runners.calibration import calibrate
 from eagle_rl.runners.checkpoint import latest_checkpoint, load_actor, read_manifest, verify_checkpoint
 from eagle_rl.runners.compass import DemonstrationEnv, ResidualBank, ResidualEnv, ResidualPolicy, begin_residual
-from eagle_rl.runners.files import write_atomically
+from eagle_rl.runners.files import patiently, write_atomically
 from eagle_rl.runners.locate import find_checkpoint
 from eagle_rl.runners.on_policy import EagleRunner, make_train_cfg
 from eagle_rl.runners.plan import Stage, stage_num_envs, warm_task
 from eagle_rl.runners.provenance import Provenance, changes
 from eagle_rl.runners.published import SUFFIX
+
+CALIBRATION = "calibration.json"
+"""File in a specialist's folder."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,8 +80,18 @@ def train(job: Job) -> Path:
     elif job.init is not None:
         runner.load_weights(job.init)
     left = job.stage.iterations - runner.current_learning_iteration
-    runner.learn(left, on_iteration=lambda iteration: job.check_claim())
+    runner.learn(left, on_iteration=lambda iteration: job.check_claim(), at_end=partial(_calibrate, job))
     return checkpoints / f"model_{job.stage.iterations}.pt"
+
+
+def _calibrate(job: Job, actor: EagleActor) -> None:
+    """Set a specialist's command gains, where asked to, and keep them, with what they did, beside its checkpoints."""
+    cfg = job.cfg
+    if job.stage.kind != "specialist" or cfg.plan.calibration_envs == 0 or job.rank > 0:
+        return
+    ev = dataclasses.replace(cfg.evaluation, num_envs_per_robot=cfg.plan.calibration_envs)
+    found = calibrate(actor, job.make_env, cfg.robots, cfg.task, ev, cfg.run.env_device)
+    patiently(lambda: write_atomically(job.folder / CALIBRATION, json.dumps(found, indent=1).encode()))
 
 
 def _make_runner(job: Job) -> EagleRunner:

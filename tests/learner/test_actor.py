@@ -77,3 +77,12 @@ def test_a_history_that_is_not_whole_frames_is_refused(actor, obs):
     architecture["networks"]["history_length"] = 7
     with pytest.raises(ValueError, match="history of 7 equal frames"):
         EagleActor.from_architecture(architecture)
+
+
+def test_a_scaled_command_acts_as_a_larger_command_did(actor, obs):
+    gains = torch.tensor([1.5, 1.0, 0.5, 2.0, 1.0])
+    larger = obs.clone()
+    larger["command"] = obs["command"] * gains
+    expected = actor(larger).clone()
+    actor.scale_command(gains.tolist())
+    torch.testing.assert_close(actor(obs), expected, atol=1e-6, rtol=1e-5)
