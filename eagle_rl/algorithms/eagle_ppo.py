@@ -150,7 +150,8 @@ class EaglePPO(PPO):
         losses = super().update()
         del losses["symmetry"]
         kl = self._mean_over_processes(self.symmetry.pop_kl(self.num_mini_batches))
-        self._adapt_learning_rate(kl)
+        if self.cfg.use_ppo_loss:  # imitation alone has no trust region to stay in
+            self._adapt_learning_rate(kl)
         self.num_updates += 1
         withheld, self._withheld_steps = self._withheld_steps, 0
         scalars = {f"Loss/{name}": value for name, value in losses.items()} | self.symmetry.pop_means()
