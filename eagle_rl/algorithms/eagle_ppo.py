@@ -83,6 +83,8 @@ class EaglePPO(PPO):
         self.specialists: SpecialistBank | None = None
         self.robot_names: list[str] = []
         self.num_updates = 0
+        self.imitation_updates = math.inf
+        """Updates over which imitation without PPO lowers its learning rate; for ever, unless told."""
         self.skipped_steps = 0
         self._skipped_in_a_row = 0
         self._withheld_steps = 0
@@ -150,9 +152,11 @@ class EaglePPO(PPO):
         losses = super().update()
         del losses["symmetry"]
         kl = self._mean_over_processes(self.symmetry.pop_kl(self.num_mini_batches))
-        if self.cfg.use_ppo_loss:  # imitation alone has no trust region to stay in
-            self._adapt_learning_rate(kl)
         self.num_updates += 1
+        if self.cfg.use_ppo_loss:
+            self._adapt_learning_rate(kl)
+        else:  # imitation alone has no trust region to stay in
+            self._anneal_learning_rate()
         withheld, self._withheld_steps = self._withheld_steps, 0
         scalars = {f"Loss/{name}": value for name, value in losses.items()} | self.symmetry.pop_means()
         counts = {"Health/skipped_updates": self.skipped_steps, "Loss/withheld_steps": withheld}
@@ -217,6 +221,12 @@ class EaglePPO(PPO):
             self.learning_rate = max(low, self.learning_rate / LEARNING_RATE_FACTOR)
         elif 0 < kl < self.cfg.desired_kl / 2:
             self.learning_rate = min(high, self.learning_rate * LEARNING_RATE_FACTOR)
+        self.optimizer.param_groups[0]["lr"] = self.learning_rate
+
+    def _anneal_learning_rate(self) -> None:
+        """Lower the actor's learning rate by a constant factor an update, to the least of its range at the last."""
+        first, last = self.cfg.learning_rate, self.cfg.learning_rate_range[0]
+        self.learning_rate = first * (last / first) ** min(1.0, self.num_updates / self.imitation_updates)
         self.optimizer.param_groups[0]["lr"] = self.learning_rate
 
     def _normalize_over_processes(self) -> None:

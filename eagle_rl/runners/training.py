@@ -112,6 +112,7 @@ def _make_runner(job: Job) -> EagleRunner:
     runner = EagleRunner(env, train_cfg, job.folder, cfg.run.device, job.provenance)
     if bank is not None and stage.imitation is not None:
         runner.alg.imitate(bank, stage.imitation)
+        runner.alg.imitation_updates = stage.iterations
     if base is not None and stage.kind == "residual":
         begin_residual(runner.alg.actor, base)
     return runner

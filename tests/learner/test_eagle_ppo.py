@@ -296,13 +296,17 @@ def test_distillation_brings_actions_and_embeddings_of_every_robot_to_its_specia
     assert all(b < 0.6 * a for a, b in zip(before, after, strict=True)), f"{before} -> {after}"
 
 
-def test_pure_imitation_keeps_its_learning_rate_however_far_the_policy_moves():
-    runner = make_runner(use_ppo_loss=False, desired_kl=1e-6)
+def test_pure_imitation_lowers_its_learning_rate_to_the_least_however_far_the_policy_moves():
+    runner = make_runner(use_ppo_loss=False, learning_rate=1e-3, learning_rate_range=(1e-5, 1.0), desired_kl=1e-6)
     with_specialists(runner)
-    collect(runner)
-    scalars = runner.alg.update()
-    assert scalars["Loss/kl"] > 1e-5, "the policy has to move for this test to mean anything"
-    assert runner.alg.optimizer.param_groups[0]["lr"] == runner.alg.cfg.learning_rate
+    runner.alg.imitation_updates = 4
+    rates = []
+    for _ in range(5):
+        collect(runner)
+        scalars = runner.alg.update()
+        rates.append(runner.alg.optimizer.param_groups[0]["lr"])
+    assert scalars["Loss/kl"] > 1e-6, "the policy has to move for this test to mean anything"
+    assert rates == pytest.approx([1e-3 * 10 ** (-step / 2) for step in (1, 2, 3, 4, 4)])
 
 
 def test_pure_imitation_leaves_the_critic_and_the_exploration_alone():
