@@ -204,6 +204,14 @@ class EaglePPO(PPO):
         self.optimizer.param_groups[1]["lr"] = self.cfg.critic_learning_rate
         return iteration
 
+    def adopt(self, learner: dict[str, Any]) -> None:
+        """Take over critic and learning rate of what :meth:`save` returned, for a policy that acts alike.
+
+        With a fresh critic, at the first learning rate, a residual falls before it has learned anything.
+        """
+        self.critic.load_state_dict(learner["critic_state_dict"])
+        self.learning_rate = self.optimizer.param_groups[0]["lr"] = learner["learning_rate"]
+
     def _too_far(self) -> bool:
         """Whether this update has moved the policy so far from the one that acted that one more step may wreck it."""
         if not self.cfg.use_ppo_loss:

@@ -441,7 +441,7 @@ class PlanCfg:
     distill_env_steps: int = 0
     """Budget of each distillation, per round."""
     base_env_steps: int = 0
-    """Budget of COMPASS's base policy, which imitates the root."""
+    """Budget of COMPASS's base policy, which imitates the root; 0 makes the root itself its base."""
     max_rounds: int = 1
     """Rounds of specialise and generalise; 1 is the paper's EAGLE, more its "w/ ID"."""
     tolerance: float = 0.01

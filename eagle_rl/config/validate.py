@@ -213,8 +213,7 @@ def _plan_faults(cfg: ExperimentCfg) -> Iterator[Fault]:
     if cfg.num_envs < len(cfg.robots):
         yield "num_envs", f"{cfg.num_envs} is less than one environment for each of {len(cfg.robots)} robots"
     if cfg.plan.method != "ppo":
-        own = ("base_env_steps",) if cfg.plan.method == "compass" else ()
-        for key in ("specialist_env_steps", "distill_env_steps", *own):
+        for key in ("specialist_env_steps", "distill_env_steps"):
             if getattr(cfg.plan, key) == 0:
                 yield f"plan.{key}", f"0, but method {cfg.plan.method} needs a budget for this stage"
     for key in ("device", "env_device"):

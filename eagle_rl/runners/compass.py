@@ -108,7 +108,7 @@ class DemonstrationEnv(_Wrapper):
     """
 
     def __init__(self, env: VecEnv, bank: SpecialistBank, frame_dim: int) -> None:
-        """Let ``bank`` act in ``env``, whose frames are ``frame_dim`` numbers."""
+        """Let ``bank`` act in ``env``, whose frames are ``frame_dim`` numbers; 0 for no world model."""
         super().__init__(env)
         self.bank, self.frame_dim = bank, frame_dim
         self._obs = env.get_observations()

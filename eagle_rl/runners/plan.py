@@ -42,6 +42,8 @@ class Stage:
     """Stage whose policy's actions the specialists' are added to (COMPASS)."""
     demonstrations: bool = False
     """Whether the teachers act instead of the policy, and nothing but imitation is learned (COMPASS)."""
+    world_model: bool = False
+    """Whether the estimator also predicts the next frame (COMPASS)."""
     seed: int
 
     @property
@@ -116,18 +118,19 @@ def _round(cfg: ExperimentCfg, number: int, generalist: str) -> list[Stage]:
 
 
 def _compass(cfg: ExperimentCfg, demonstrator: str) -> list[Stage]:
-    """The three stages of COMPASS after its demonstrations' author."""
+    """The stages of COMPASS after its demonstrator, who is the base where nothing is spent on imitating it."""
     plan = cfg.plan
+    imitates = plan.base_env_steps > 0
+    imitation: dict[str, object] = {
+        "round": 1,
+        "imitation": "kickstart",
+        "demonstrations": True,
+        "world_model": imitates,
+    }
     base = _stage(
-        cfg,
-        "compass/base",
-        "base",
-        plan.base_env_steps,
-        round=1,
-        teachers=(demonstrator,) * len(cfg.robots),
-        imitation="kickstart",
-        demonstrations=True,
+        cfg, "compass/base", "base", plan.base_env_steps, teachers=(demonstrator,) * len(cfg.robots), **imitation
     )
+    origin = base.name if imitates else demonstrator
     residuals = [
         _stage(
             cfg,
@@ -136,23 +139,22 @@ def _compass(cfg: ExperimentCfg, demonstrator: str) -> list[Stage]:
             plan.specialist_env_steps,
             round=1,
             robots=(robot,),
-            base=base.name,
+            base=origin,
         )
         for robot in cfg.robots
     ]
+    teachers = tuple(stage.name for stage in residuals)
     distill = _stage(
         cfg,
         "compass/distill",
         "distill",
         plan.distill_env_steps,
-        round=1,
-        init=base.name,
-        base=base.name,
-        teachers=tuple(stage.name for stage in residuals),
-        imitation="kickstart",
-        demonstrations=True,
+        init=origin,
+        base=origin,
+        teachers=teachers,
+        **imitation,
     )
-    return [base, *residuals, distill]
+    return [*([base] if imitates else []), *residuals, distill]
 
 
 def plan_stages(cfg: ExperimentCfg, processes: int = 1) -> list[Stage]:

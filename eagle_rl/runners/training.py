@@ -20,7 +20,7 @@ from eagle_rl.errors import CheckpointError
 from eagle_rl.evaluation.evaluate import MakeEnv, Policy
 from eagle_rl.models import EagleActor
 from eagle_rl.runners.calibration import calibrate
-from eagle_rl.runners.checkpoint import latest_checkpoint, load_actor, read_manifest, verify_checkpoint
+from eagle_rl.runners.checkpoint import latest_checkpoint, load_actor, load_checkpoint, read_manifest, verify_checkpoint
 from eagle_rl.runners.compass import DemonstrationEnv, ResidualBank, ResidualEnv, ResidualPolicy, begin_residual
 from eagle_rl.runners.files import patiently, write_atomically
 from eagle_rl.runners.locate import find_checkpoint
@@ -103,7 +103,8 @@ def _make_runner(job: Job) -> EagleRunner:
     if stage.demonstrations:
         actors = _teachers(job, acting_base, cfg.run.env_device)
         assert actors is not None, "a stage of demonstrations has specialists"
-        env = DemonstrationEnv(env, actors, env.get_observations()["history"].shape[1] // history)
+        frame_dim = env.get_observations()["history"].shape[1] // history
+        env = DemonstrationEnv(env, actors, frame_dim if stage.world_model else 0)
     elif acting_base is not None:
         env = ResidualEnv(env, acting_base)
     base = _load(job.base, cfg.run.device)
@@ -113,8 +114,9 @@ def _make_runner(job: Job) -> EagleRunner:
     if bank is not None and stage.imitation is not None:
         runner.alg.imitate(bank, stage.imitation)
         runner.alg.imitation_updates = stage.iterations
-    if base is not None and stage.kind == "residual":
+    if job.base is not None and base is not None and stage.kind == "residual":
         begin_residual(runner.alg.actor, base)
+        runner.alg.adopt(load_checkpoint(job.base).state["algorithm"])
     return runner
 
 

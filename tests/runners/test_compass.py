@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -126,3 +128,20 @@ def test_what_the_learner_sets_on_a_wrapper_reaches_the_environment(actors):
     assert inner.episode_length_buf.all()
     assert wrapped.episode_length_buf is inner.episode_length_buf
     assert not hasattr(inner, "base"), "the wrapper's own parts stay with it"
+
+
+def test_on_a_root_residuals_begin_with_its_critic_and_the_result_has_its_shape(run, tmp_path):
+    """A residual judged by a fresh critic, at the first learning rate, falls before it has learned anything."""
+    root = run.run_dir / run.records["generalist"].checkpoint
+    cfg = toy_experiment(iterations=1, judge_envs=0, method="compass", base_env_steps=0, root=str(root))
+    frozen = replace(cfg, algo=replace(cfg.algo, critic_learning_rate=1e-12))
+    result = run_experiment(frozen, tmp_path / "run", make_toy_env)
+    learners = [torch.load(path, weights_only=True)["algorithm"] for path in (root, _final(result, "residual_one"))]
+    for key, x in learners[0]["critic_state_dict"].items():
+        torch.testing.assert_close(learners[1]["critic_state_dict"][key], x, msg=f"critic's {key} is not the root's")
+    generalist, distilled = (load_actor(path)[0].architecture for path in (root, result.generalist))
+    assert distilled == generalist, "without world model the policy has the root's shape"
+
+
+def _final(result, name):
+    return result.run_dir / result.records[f"compass/{name}"].checkpoint

@@ -91,6 +91,14 @@ def test_compass_imitates_then_specialises_by_residuals_then_distils():
     assert (base.demonstrations, residual.demonstrations, distill.demonstrations) == (True, False, True)
 
 
+def test_compass_without_a_budget_for_imitation_builds_on_the_root_itself():
+    stages = {stage.name: stage for stage in plan(method="compass", base_env_steps=0, root="model.pt")}
+    assert "compass/base" not in stages
+    assert stages["compass/residual_g1"].inputs == ("root",)
+    distill = stages["compass/distill"]
+    assert (distill.init, distill.base, distill.world_model) == ("root", "root", False)
+
+
 def test_a_warm_task_has_whole_penalties_finishing_ranges_and_no_aids():
     task = warm_task(ExperimentCfg(name="x").task)
     assert (task.aids.harness, task.aids.gait_shaping, task.rewards.penalty_initial) == (0.0, 0.0, 1.0)
