@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from statistics import fmean
 
 from eagle_rl.config.schema import EvaluationCfg, TaskCfg
 from eagle_rl.evaluation.evaluate import MakeEnv, evaluate
@@ -20,7 +21,9 @@ VELOCITIES = {"v_y": 1, "v_x": 0, "omega": 2}
 GAINS = (1.1, 1.2)
 """Tried on each [-]; a policy has seen no commands beyond its range, so they stay close to it."""
 MIN_IMPROVEMENT = 0.005
-"""Share of the tracking score a gain must be worth [-]: what it does to falls and noise is not looked at."""
+"""Share of the tracking score a gain must be worth [-]."""
+MAX_LOSS = 0.05
+"""Share by which all gains together may make any command's error larger [-]: N1, walking faster, swings more."""
 NUM_STEPS = 300
 """Control steps of a trial, at most."""
 
@@ -43,20 +46,25 @@ def calibrate(
     """
     ev = dataclasses.replace(ev, num_steps=min(ev.num_steps, NUM_STEPS), seed=ev.seed + 1)
 
-    def score(gains: Sequence[float]) -> float:
+    def measure(gains: Sequence[float]) -> tuple[float, list[float]]:
+        """Tracking score and charged error of each command, mean over robots."""
         trial = EagleActor.from_architecture(actor.architecture)
         trial.load_state_dict(actor.state_dict())
         trial.scale_command(gains)
-        return pooled_score(evaluate(trial.to(device), make_env, robots, task, ev))
+        metrics = evaluate(trial.to(device), make_env, robots, task, ev)
+        charged = [robot.subsets["all"].charged for robot in metrics.values()]
+        return pooled_score(metrics), [fmean(error or 0.0 for error in errors) for errors in zip(*charged, strict=True)]
 
     best = [1.0] * actor.architecture["observations"]["command"]
-    before = after = score(best)
+    before, errors = measure(best)
+    after = before
     for component in VELOCITIES.values():
         for gain in GAINS:
             gains = [gain if i == component else kept for i, kept in enumerate(best)]
-            found = score(gains)
-            if found > after * (1 - MIN_IMPROVEMENT):
+            score, now = measure(gains)
+            harms = any(error > first * (1 + MAX_LOSS) for error, first in zip(now, errors, strict=True))
+            if harms or score > after * (1 - MIN_IMPROVEMENT):
                 break
-            best, after = gains, found
+            best, after = gains, score
     actor.scale_command(best)
     return {name: best[i] for name, i in VELOCITIES.items()} | {"score_before": before, "score_after": after}

@@ -76,6 +76,18 @@ def test_a_velocity_that_falls_short_is_asked_for_more_and_no_other(shares, gain
     assert found["score_after"] <= found["score_before"]
 
 
+def test_a_gain_that_spoils_another_command_is_not_taken():
+    """A robot that turns a little as it walks turns a tenth more at a tenth more speed, though its score is better."""
+    actor = follower((0.8, 1.0, 1.0, 1.0, 1.0))
+    ev = EvaluationCfg(num_envs_per_robot=64, num_steps=4)
+    assert calibrate(actor, make_following_env, ["h1"], TaskCfg(), ev, "cpu")["v_x"] == 1.2
+    turning = follower((0.8, 1.0, 1.0, 1.0, 1.0))
+    with torch.no_grad():
+        turning.mlp[-1].weight[2, 0] = 0.05
+        turning.mlp[-1].bias[2] -= 0.05 * SHIFT
+    assert calibrate(turning, make_following_env, ["h1"], TaskCfg(), ev, "cpu")["v_x"] == 1.0
+
+
 def test_gains_are_in_the_weights():
     actor = follower((1.0, 0.5, 1.0, 1.0, 1.0))
     calibrate(actor, make_following_env, ["h1"], TaskCfg(), EvaluationCfg(num_envs_per_robot=64, num_steps=4), "cpu")
