@@ -30,6 +30,7 @@ POOLING = "envs/pooling.py"
 AIDS = "envs/mdp/aids.py"
 POSTURE = "envs/robots/posture.py"
 RESTING = "envs/mdp/posture.py"
+CALIBRATION = "eagle_rl/runners/calibration.py"
 LOSSES = "eagle_rl/algorithms/losses.py"
 GAUSSIAN = "eagle_rl/models/distribution.py"
 PPO = "eagle_rl/algorithms/eagle_ppo.py"
@@ -187,4 +188,14 @@ MUTANTS: tuple[Mutant, ...] = (
         "enumerate(self.specialists[::-1])",
         LEARNER_TESTS,
     ),
+    Mutant(LOSSES, "action / (teacher_std + 1 - mask)", "action * (teacher_std + 1 - mask)", LEARNER_TESTS),
+    Mutant(CALIBRATION, "if harms or score", "if score", "runners/test_calibration.py"),
+    Mutant(CALIBRATION, "1 - MIN_IMPROVEMENT", "1 + MIN_IMPROVEMENT", "runners/test_calibration.py"),
+    Mutant(
+        "eagle_rl/models/actor.py",
+        'self._latent_dim - dims["clock"] - dims["command"], self._latent_dim',
+        'self._latent_dim - dims["command"], self._latent_dim + dims["clock"]',
+        "learner/test_actor.py",
+    ),
+    Mutant(PPO, "(last / first) ** min", "(first / last) ** min", LEARNER_TESTS),
 )

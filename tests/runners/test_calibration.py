@@ -67,6 +67,7 @@ def follower(shares: Sequence[float]) -> EagleActor:
         ((1.0, 0.5, 1.0, 1.0, 1.0), (1.0, 1.2, 1.0)),
         ((0.92, 0.8, 0.9, 0.5, 0.5), (1.1, 1.2, 1.1)),
         ((1.2, 1.0, 1.2, 1.0, 1.0), (1.0, 1.0, 1.0)),
+        ((0.952, 1.0, 1.0, 0.5, 0.5), (1.0, 1.0, 1.0)),  # 1.047 is hardly nearer than 0.952
     ],
 )
 def test_a_velocity_that_falls_short_is_asked_for_more_and_no_other(shares, gains):
