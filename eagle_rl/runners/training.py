@@ -84,14 +84,15 @@ def train(job: Job) -> Path:
     return checkpoints / f"model_{job.stage.iterations}.pt"
 
 
-def _calibrate(job: Job, actor: EagleActor) -> None:
-    """Set a specialist's command gains, where asked to, and keep them, with what they did, beside its checkpoints."""
+def _calibrate(job: Job, actor: EagleActor) -> bool:
+    """Set a specialist's command gains and keep them, with what they did, beside its checkpoints; whether asked to."""
     cfg = job.cfg
     if job.stage.kind != "specialist" or cfg.plan.calibration_envs == 0 or job.rank > 0:
-        return
+        return False
     ev = dataclasses.replace(cfg.evaluation, num_envs_per_robot=cfg.plan.calibration_envs)
     found = calibrate(actor, job.make_env, cfg.robots, cfg.task, ev, cfg.run.env_device)
     patiently(lambda: write_atomically(job.folder / CALIBRATION, json.dumps(found, indent=1).encode()))
+    return True
 
 
 def _make_runner(job: Job) -> EagleRunner:
