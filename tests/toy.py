@@ -83,6 +83,9 @@ class ToyEnv(VecEnv):
         extras = {"time_outs": time_outs, "log": log, "final_ids": final_ids, "final_observations": final}
         return self.get_observations(), -error, time_outs | falls, extras
 
+    def reset(self) -> None:
+        self._reset(torch.arange(self.num_envs))
+
     def state_dict(self) -> dict[str, Any]:
         names = ("episode_length_buf", "resets", "command", "frames")
         return {name: getattr(self, name).clone() for name in names}

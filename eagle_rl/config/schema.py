@@ -434,7 +434,7 @@ class PlanCfg:
     generalist_env_steps: int = 20_000_000
     """Budget of the root policy."""
     specialist_env_steps: int = 0
-    """Budget of each specialist, per round."""
+    """Budget of each specialist's training, per round; 0, where there is a search, starts that from the generalist."""
     specialist_num_envs: int = 0
     """Environments of a specialist; 0 for as many as the pool has: its batches are then so many times larger than one
     robot's share of the pool, and its iterations fewer (ours)."""
@@ -449,11 +449,36 @@ class PlanCfg:
     root: str | None = None
     """Checkpoint to fork from instead of training a generalist; with method ``ppo`` the generalist's budget is then
     spent on continuing from it."""
-    calibration_envs: int = 0
-    """Environments in which a trained specialist tries gains on its velocity commands and keeps those that help; 0 for
-    none (ours)."""
+    search_env_steps: int = 0
+    """Budget of the search that follows each specialist's training; 0 for none (ours)."""
     judge_envs_per_robot: int = 64
     """Environments per robot in the evaluation that ends each stage and decides on convergence; 0 leaves it out."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchCfg:
+    """Search over a specialist's last layer, with tracking errors for a cost (ours; docs/experiments.md, 20)."""
+
+    num_pairs: int = 192
+    """Pairs of policies tried in a generation [-]."""
+    num_steps: int = 240
+    """Control steps each of them is given, from rest."""
+    settling_steps: int = 40
+    """The first of them, which are not judged."""
+    resampling_time_s: float = 2.4
+    """Time between commands [s]; 0 keeps the first."""
+    standing_probability: float = 0.2
+    """Share of commands without velocity [-]."""
+    num_directions: int = 24
+    """Principal directions of the last hidden layer that are searched, for each joint [-]."""
+    std: float = 0.015
+    """Perturbation of an action by each direction [-]."""
+    step: float = 0.125
+    """Length of the first step as a share of that of a perturbation [-]; the last one is a fifth of it."""
+    error_units: tuple[float, float, float, float, float] = (0.05, 0.08, 0.05, 0.02, 0.04)
+    """Errors of v_x, v_y, omega, height and pitch that weigh the same [m/s, m/s, rad/s, m, rad]."""
+    randomization: bool = False
+    """Bodies, motors, noise and pushes as in training, the same for both policies of a pair."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -508,5 +533,6 @@ class ExperimentCfg:
     task: TaskCfg = field(default_factory=TaskCfg)
     algo: AlgoCfg = field(default_factory=AlgoCfg)
     plan: PlanCfg = field(default_factory=PlanCfg)
+    search: SearchCfg = field(default_factory=SearchCfg)
     evaluation: EvaluationCfg = field(default_factory=EvaluationCfg)
     run: RunCfg = field(default_factory=RunCfg)

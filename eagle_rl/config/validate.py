@@ -43,6 +43,7 @@ BOUNDS: dict[str, _Bound] = dict.fromkeys(
     algo.critic_learning_rate
     algo.desired_kl algo.max_grad_norm algo.network.embedding_dim algo.network.init_std
     plan.generalist_env_steps plan.max_rounds
+    search.num_pairs search.num_steps search.num_directions search.std search.step
     evaluation.num_envs_per_robot evaluation.num_steps evaluation.physics_dt evaluation.decimation
     run.save_interval run.keep_checkpoints
     """.split(),
@@ -56,7 +57,7 @@ BOUNDS |= dict.fromkeys(
     task.gait.phase_offset task.gait.leg_scaling task.aids.harness_decay task.aids.gait_shaping_decay
     task.aids.min_episode_ratio task.aids.min_contact_match task.aids.harness_contact_match task.control.upper_ratio
     task.control.waist_ratio
-    algo.lam plan.tolerance
+    algo.lam plan.tolerance search.standing_probability
     """.split(),
     _SHARE,
 )
@@ -74,7 +75,9 @@ BOUNDS["task.control.posture_reference"] = ("from 0 to 1.5", lambda x: 0 <= x <=
 CEILINGS: dict[str, float] = {
     "num_envs": 1e6,
     "evaluation.num_envs_per_robot": 1e6,
-    "plan.calibration_envs": 1e6,
+    "search.num_pairs": 1e6,
+    "search.num_steps": 1e6,
+    "search.num_directions": 1e5,
     "plan.judge_envs_per_robot": 1e6,
     "plan.specialist_num_envs": 1e6,
     "evaluation.num_steps": 1e6,
@@ -95,6 +98,7 @@ _MAX_ITEM = 1e5
 """Bound on any number in a list: widths, points, ranges."""
 POSITIVE_ITEMS = {f"algo.network.{part}_dims" for part in ("encoder", "estimator", "actor", "critic")} | {
     "algo.network.std_range",
+    "search.error_units",
     "algo.learning_rate_range",
     "task.observations.scales.command",
 }
@@ -212,10 +216,15 @@ def _plan_faults(cfg: ExperimentCfg) -> Iterator[Fault]:
         yield "robots", f"named twice: {', '.join(repeated)}"
     if cfg.num_envs < len(cfg.robots):
         yield "num_envs", f"{cfg.num_envs} is less than one environment for each of {len(cfg.robots)} robots"
-    if cfg.plan.method != "ppo":
-        for key in ("specialist_env_steps", "distill_env_steps"):
-            if getattr(cfg.plan, key) == 0:
-                yield f"plan.{key}", f"0, but method {cfg.plan.method} needs a budget for this stage"
+    plan = cfg.plan
+    if plan.method != "ppo":
+        specialists = plan.specialist_env_steps + (0 if plan.method == "compass" else plan.search_env_steps)
+        budgets = {"specialist_env_steps": specialists, "distill_env_steps": plan.distill_env_steps}
+        for key in (key for key, budget in budgets.items() if budget == 0):
+            yield f"plan.{key}", f"0, but method {plan.method} needs a budget for this stage"
+    steps, settling = cfg.search.num_steps, cfg.search.settling_steps
+    if steps <= settling:
+        yield "search.num_steps", f"got {steps}, expected more than search.settling_steps, {settling}"
     for key in ("device", "env_device"):
         if not re.fullmatch(r"cpu|cuda(:\d+)?", getattr(cfg.run, key)):
             yield f"run.{key}", f"got {getattr(cfg.run, key)!r}, expected cpu, cuda or cuda:N"

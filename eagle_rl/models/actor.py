@@ -102,13 +102,10 @@ class EagleActor(MLPModel):
         """Mean actions (N, 32) of other observations; leaves no trace in the actor."""
         return self.mlp(self.features(history, command, clock)[0]) * slot_mask
 
-    @torch.no_grad()
-    def scale_command(self, gains: Sequence[float]) -> None:
-        """Act from now on as it did for ``gains`` times the command, one gain [-] for each component."""
-        dims = self.architecture["observations"]
-        columns = slice(self._latent_dim - dims["clock"] - dims["command"], self._latent_dim - dims["clock"])
-        weight = self.mlp[0].weight
-        weight[:, columns] *= torch.tensor(gains, dtype=weight.dtype, device=weight.device)
+    def hidden(self, obs: TensorDict) -> Tensor:
+        """Activations (N, H) that the last layer of the policy head makes the mean actions of; leaves no trace."""
+        latent = self.features(*(obs[group] for group in ACTOR_INPUTS))[0]
+        return nn.Sequential(*list(self.mlp)[:-1])(latent)
 
     def as_onnx(self, verbose: bool = False) -> nn.Module:
         """Exportable copy: (history, command, clock, slot_mask) -> (actions, estimate, embedding)."""

@@ -104,7 +104,6 @@ class EagleRunner(OnPolicyRunner):
         num_learning_iterations: int,
         init_at_random_ep_len: bool = True,
         on_iteration: Callable[[int], None] = lambda iteration: None,
-        at_end: Callable[[EagleActor], bool] = lambda actor: False,
     ) -> Path | None:
         """Train, then save.
 
@@ -114,7 +113,6 @@ class EagleRunner(OnPolicyRunner):
             num_learning_iterations: iterations to add to those done.
             init_at_random_ep_len: spread the ages of the first episodes, so that not all end at once.
             on_iteration: told the number of iterations done after each.
-            at_end: may change the trained policy before it is saved for good, and says whether it did.
 
         Returns:
             The final checkpoint; None where nothing is written.
@@ -146,8 +144,6 @@ class EagleRunner(OnPolicyRunner):
             if not self.is_distributed:  # the other processes cannot be asked for their part of the state
                 self._save_before_stopping(error)
             raise
-        if at_end(self.alg.actor):
-            self._saved = None
         return self.save(stage_end=True)
 
     def _iterate(self) -> dict[str, float]:

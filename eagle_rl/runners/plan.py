@@ -1,7 +1,8 @@
 """Algorithm 1 of the paper as data: which stages an experiment consists of, what each starts from and what it costs.
 
 Line 1 of the algorithm is the stage ``generalist`` (or ``root``, when the experiment forks from a checkpoint); lines
-3-4 are ``roundR/specialist_ROBOT``; lines 5-9 are ``roundR/distill``. Nothing here imports torch.
+3-4 are ``roundR/specialist_ROBOT`` and, ours, ``roundR/search_ROBOT``; lines 5-9 are ``roundR/distill``. Nothing here
+imports torch.
 """
 
 from __future__ import annotations
@@ -13,11 +14,11 @@ from typing import Literal
 
 from eagle_rl.config.schema import ExperimentCfg, TaskCfg
 
-Kind = Literal["root", "generalist", "continued", "specialist", "distill", "base", "residual"]
+Kind = Literal["root", "generalist", "continued", "specialist", "search", "distill", "base", "residual"]
 Imitation = Literal["eagle", "kickstart"]
 
-ALONE: tuple[Kind, ...] = ("specialist", "residual")
-"""What trains one robot."""
+ALONE: tuple[Kind, ...] = ("specialist", "search", "residual")
+"""What improves one robot."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,11 +33,11 @@ class Stage:
     env_steps: int
     """Budget; one robot, one 50 Hz control step is 1."""
     iterations: int
-    """The budget in whole learning iterations, rounded up."""
+    """The budget in whole learning iterations, or generations of a search, rounded up."""
     init: str | None = None
     """Stage whose final weights this one starts from."""
     teachers: tuple[str, ...] = ()
-    """Specialist stage of each robot, in the order of ``robots``."""
+    """The stage that ended each robot's specialist, in the order of ``robots``."""
     imitation: Imitation | None = None
     base: str | None = None
     """Stage whose policy's actions the specialists' are added to (COMPASS)."""
@@ -79,7 +80,10 @@ def stage_num_envs(cfg: ExperimentCfg, kind: Kind) -> int:
 
 def _stage(cfg: ExperimentCfg, name: str, kind: Kind, env_steps: int, **rest: object) -> Stage:
     """A stage with its budget in iterations and a seed of its own."""
-    steps = stage_num_envs(cfg, kind) * cfg.algo.num_steps_per_env
+    if kind == "search":
+        steps = 2 * cfg.search.num_pairs * cfg.search.num_steps
+    else:
+        steps = stage_num_envs(cfg, kind) * cfg.algo.num_steps_per_env
     fields = {
         "round": 0,
         "robots": cfg.robots,
@@ -89,32 +93,31 @@ def _stage(cfg: ExperimentCfg, name: str, kind: Kind, env_steps: int, **rest: ob
     return Stage(name=name, kind=kind, env_steps=env_steps, **{**fields, **rest})  # type: ignore[arg-type]
 
 
+def _specialist(cfg: ExperimentCfg, number: int, robot: str, generalist: str) -> list[Stage]:
+    """Training and search of one specialist, whichever of them has a budget."""
+    budgets: dict[Kind, int] = {"specialist": cfg.plan.specialist_env_steps, "search": cfg.plan.search_env_steps}
+    stages: list[Stage] = []
+    for kind, budget in budgets.items():
+        if budget:
+            name, init = f"round{number}/{kind}_{Path(robot).stem}", stages[-1].name if stages else generalist
+            stages.append(_stage(cfg, name, kind, budget, round=number, robots=(robot,), init=init))
+    return stages
+
+
 def _round(cfg: ExperimentCfg, number: int, generalist: str) -> list[Stage]:
     """Specialists and distillation of one round (lines 3-9)."""
-    plan = cfg.plan
-    specialists = [
-        _stage(
-            cfg,
-            f"round{number}/specialist_{Path(robot).stem}",
-            "specialist",
-            plan.specialist_env_steps,
-            round=number,
-            robots=(robot,),
-            init=generalist,
-        )
-        for robot in cfg.robots
-    ]
+    specialists = [_specialist(cfg, number, robot, generalist) for robot in cfg.robots]
     distill = _stage(
         cfg,
         f"round{number}/distill",
         "distill",
-        plan.distill_env_steps,
+        cfg.plan.distill_env_steps,
         round=number,
         init=generalist,
-        teachers=tuple(stage.name for stage in specialists),
-        imitation="kickstart" if plan.method == "kickstarting" else "eagle",
+        teachers=tuple(stages[-1].name for stages in specialists),
+        imitation="kickstart" if cfg.plan.method == "kickstarting" else "eagle",
     )
-    return [*specialists, distill]
+    return [*(stage for stages in specialists for stage in stages), distill]
 
 
 def _compass(cfg: ExperimentCfg, demonstrator: str) -> list[Stage]:

@@ -52,6 +52,8 @@ class ProgressReport:
         if "Train/mean_reward" in scalars:
             reward, length = scalars["Train/mean_reward"], scalars["Train/mean_episode_length"]
             episodes = f"reward {reward:.2f} | length {length:.0f}"
+        if "Search/cost" in scalars:
+            episodes = f"cost {scalars['Search/cost']:.3f} | survival {scalars['Search/survival']:.1%}"
         speed = f"{env_steps / 1e6:.2f}M steps | {scalars['Perf/total_fps']:.0f}/s"
         text = f"{self._title} {iteration}/{self._last} | {speed} | {episodes}"
         if self._bar is not None:

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,18 +17,15 @@ from eagle_rl.config.schema import ExperimentCfg
 from eagle_rl.errors import CheckpointError
 from eagle_rl.evaluation.evaluate import MakeEnv, Policy
 from eagle_rl.models import EagleActor
-from eagle_rl.runners.calibration import calibrate
 from eagle_rl.runners.checkpoint import latest_checkpoint, load_actor, load_checkpoint, read_manifest, verify_checkpoint
 from eagle_rl.runners.compass import DemonstrationEnv, ResidualBank, ResidualEnv, ResidualPolicy, begin_residual
-from eagle_rl.runners.files import patiently, write_atomically
+from eagle_rl.runners.files import write_atomically
 from eagle_rl.runners.locate import find_checkpoint
 from eagle_rl.runners.on_policy import EagleRunner, make_train_cfg
 from eagle_rl.runners.plan import Stage, stage_num_envs, warm_task
 from eagle_rl.runners.provenance import Provenance, changes
 from eagle_rl.runners.published import SUFFIX
-
-CALIBRATION = "calibration.json"
-"""File in a specialist's folder."""
+from eagle_rl.runners.searching import SearchRunner
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,25 +69,27 @@ def train(job: Job) -> Path:
         return latest
     if job.stage.kind == "root":
         return _copy_root(job, checkpoints)
+    if job.stage.kind == "search":
+        return _search(job, latest)
     runner = _make_runner(job)
     if latest is not None:
         runner.load(latest, allow_drift=job.allow_drift)
     elif job.init is not None:
         runner.load_weights(job.init)
     left = job.stage.iterations - runner.current_learning_iteration
-    runner.learn(left, on_iteration=lambda iteration: job.check_claim(), at_end=partial(_calibrate, job))
+    runner.learn(left, on_iteration=lambda iteration: job.check_claim())
     return checkpoints / f"model_{job.stage.iterations}.pt"
 
 
-def _calibrate(job: Job, actor: EagleActor) -> bool:
-    """Set a specialist's command gains and keep them, with what they did, beside its checkpoints; whether asked to."""
-    cfg = job.cfg
-    if job.stage.kind != "specialist" or cfg.plan.calibration_envs == 0 or job.rank > 0:
-        return False
-    ev = dataclasses.replace(cfg.evaluation, num_envs_per_robot=cfg.plan.calibration_envs)
-    found = calibrate(actor, job.make_env, cfg.robots, cfg.task, ev, cfg.run.env_device)
-    patiently(lambda: write_atomically(job.folder / CALIBRATION, json.dumps(found, indent=1).encode()))
-    return True
+def _search(job: Job, latest: Path | None) -> Path:
+    """Search to the stage's last generation; only the first of several processes does, the others wait."""
+    if job.rank == 0:
+        assert job.init is not None, "a search starts from a policy"
+        runner = SearchRunner(job.cfg, job.stage, job.init, job.folder, job.make_env, job.provenance)
+        if latest is not None:
+            runner.load(latest)
+        return runner.run(job.check_claim)
+    return job.folder / "checkpoints" / f"model_{job.stage.iterations}.pt"
 
 
 def _make_runner(job: Job) -> EagleRunner:

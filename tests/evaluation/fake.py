@@ -30,6 +30,9 @@ class ScriptedEnv:
     def get_observations(self) -> TensorDict:
         return TensorDict({"command": self.command.clone()}, batch_size=[self.num_envs])
 
+    def reset(self) -> None:
+        self.t = 0
+
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
         self.t += 1
         self.measured = actions[:, :5]

@@ -79,10 +79,6 @@ def test_a_history_that_is_not_whole_frames_is_refused(actor, obs):
         EagleActor.from_architecture(architecture)
 
 
-def test_a_scaled_command_acts_as_a_larger_command_did(actor, obs):
-    gains = torch.tensor([1.5, 1.0, 0.5, 2.0, 1.0])
-    larger = obs.clone()
-    larger["command"] = obs["command"] * gains
-    expected = actor(larger).clone()
-    actor.scale_command(gains.tolist())
-    torch.testing.assert_close(actor(obs), expected, atol=1e-6, rtol=1e-5)
+def test_the_last_layer_makes_the_mean_actions_of_the_hidden_activations(actor, obs):
+    expected = actor(obs)
+    torch.testing.assert_close(actor.mlp[-1](actor.hidden(obs)) * obs["slot_mask"], expected)

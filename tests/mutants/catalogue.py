@@ -30,7 +30,9 @@ POOLING = "envs/pooling.py"
 AIDS = "envs/mdp/aids.py"
 POSTURE = "envs/robots/posture.py"
 RESTING = "envs/mdp/posture.py"
-CALIBRATION = "eagle_rl/runners/calibration.py"
+SEARCH = "eagle_rl/algorithms/search.py"
+SEARCHING = "eagle_rl/runners/searching.py"
+TRIALS = "eagle_rl/evaluation/trials.py"
 LOSSES = "eagle_rl/algorithms/losses.py"
 GAUSSIAN = "eagle_rl/models/distribution.py"
 PPO = "eagle_rl/algorithms/eagle_ppo.py"
@@ -189,13 +191,20 @@ MUTANTS: tuple[Mutant, ...] = (
         LEARNER_TESTS,
     ),
     Mutant(LOSSES, "action / (teacher_std + 1 - mask)", "action * (teacher_std + 1 - mask)", LEARNER_TESTS),
-    Mutant(CALIBRATION, "if harms or score", "if score", "runners/test_calibration.py"),
-    Mutant(CALIBRATION, "1 - MIN_IMPROVEMENT", "1 + MIN_IMPROVEMENT", "runners/test_calibration.py"),
     Mutant(
-        "eagle_rl/models/actor.py",
-        'self._latent_dim - dims["clock"] - dims["command"], self._latent_dim',
-        'self._latent_dim - dims["command"], self._latent_dim + dims["clock"]',
-        "learner/test_actor.py",
+        SEARCH,
+        "self.parameters + step, self.parameters - step",
+        "self.parameters - step, self.parameters + step",
+        "learner/test_search.py",
     ),
+    Mutant(SEARCH, "better.clamp(-bound, bound)", "better", "learner/test_search.py"),
+    Mutant(SEARCH, "- weight @ self.mean", "", "learner/test_search.py"),
+    Mutant(
+        TRIALS,
+        "torch.where(fell.unsqueeze(1), self._fallen_errors, ",
+        "torch.where(fell.unsqueeze(1), 0.0, ",
+        "evaluation/test_trials.py",
+    ),
+    Mutant(TRIALS, "t >= self._cfg.settling_steps", "t > self._cfg.settling_steps", "evaluation/test_trials.py"),
     Mutant(PPO, "(last / first) ** min", "(first / last) ** min", LEARNER_TESTS),
 )

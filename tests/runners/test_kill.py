@@ -19,9 +19,12 @@ from eagle_rl.runners.stages import run_experiment
 from tests.runners.toy_run import STEPS, JudgedToyEnv, parameters, toy_experiment
 
 EAGLE = toy_experiment(iterations=3)
+SEARCH = toy_experiment(iterations=3, search_env_steps=12 * 40)
 COMPASS = toy_experiment(iterations=3, method="compass")
 MID_ITERATION = 2 * STEPS + 1
 """Control steps of a stage before its process dies: in its last iteration, two checkpoints written."""
+MID_GENERATION = 5 + 10 * 5 + 3
+"""The same of a search: in its eleventh generation, one checkpoint written."""
 
 
 class DeadlyEnv(JudgedToyEnv):
@@ -61,12 +64,13 @@ def run_until_killed(cfg: ExperimentCfg, folder: Path, seed: int, steps: int) ->
 
 
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded, use of fork")
-@pytest.mark.parametrize("cfg", [EAGLE, COMPASS], ids=["eagle", "compass"])
+@pytest.mark.filterwarnings("ignore:.*nothing better found")
+@pytest.mark.parametrize("cfg", [EAGLE, COMPASS, SEARCH], ids=["eagle", "compass", "search"])
 def test_killed_in_every_stage_a_run_ends_with_the_same_parameters(cfg, tmp_path):
     whole = run_experiment(cfg, tmp_path / "whole", MakeEnv(None, 0))
     folder = tmp_path / "killed"
     for stage in plan_stages(cfg):
-        run_until_killed(cfg, folder, stage.seed, MID_ITERATION)
+        run_until_killed(cfg, folder, stage.seed, MID_GENERATION if stage.kind == "search" else MID_ITERATION)
     run_until_killed(cfg, folder, cfg.evaluation.seed, 3)
     killed = run_experiment(cfg, folder, MakeEnv(None, 0), resume=True)
     expected, found = parameters(whole), parameters(killed)

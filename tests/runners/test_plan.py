@@ -38,6 +38,21 @@ def test_distillation_has_one_teacher_per_robot_in_order():
     assert distill.teachers == tuple(f"round1/specialist_{robot}" for robot in cfg.robots)
 
 
+def test_a_search_follows_each_specialists_training_and_ends_with_the_teacher():
+    stages = {stage.name: stage for stage in plan(search_env_steps=2 * 192 * 240 + 1)}
+    search = stages["round2/search_g1"]
+    assert search.inputs == ("round2/specialist_g1",)
+    assert search.iterations == 2, "generations of 192 pairs and 240 steps"
+    assert stages["round2/distill"].teachers[1] == search.name
+    assert search.specialised
+
+
+def test_a_search_alone_starts_from_the_generalist():
+    stages = {stage.name: stage for stage in plan(specialist_env_steps=0, search_env_steps=10)}
+    assert not [name for name in stages if "specialist" in name]
+    assert stages["round2/search_g1"].inputs == ("round1/distill",)
+
+
 def test_inputs_come_before_the_stages_that_need_them():
     seen: set[str] = set()
     for stage in plan():

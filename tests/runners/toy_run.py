@@ -15,6 +15,7 @@ from eagle_rl.config.schema import (
     ObservationsCfg,
     PlanCfg,
     RunCfg,
+    SearchCfg,
     TaskCfg,
 )
 from eagle_rl.runners.stages import RunResult
@@ -62,6 +63,7 @@ def toy_experiment(iterations: int = 3, judge_envs: int = 4, **plan: object) -> 
         task=TaskCfg(observations=ObservationsCfg(history_length=FRAMES)),
         algo=AlgoCfg(num_steps_per_env=STEPS, num_learning_epochs=1, num_mini_batches=2, network=NETWORK),
         plan=PlanCfg(**{"method": "eagle", "judge_envs_per_robot": judge_envs, **budgets, **plan}),  # type: ignore[arg-type]
+        search=SearchCfg(num_pairs=4, num_steps=5, settling_steps=1, resampling_time_s=0.04),
         evaluation=EvaluationCfg(num_steps=5),
         run=RunCfg(save_interval=1, torch_threads=1),  # forked processes cannot use threads of their parent
     )

@@ -1,0 +1,101 @@
+"""Pairs of trials that differ in nothing but the policy: same start, same commands, same random numbers."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from eagle_rl.config.schema import EvaluationCfg, ExperimentCfg
+from eagle_rl.evaluation.evaluate import MakeEnv
+from eagle_rl.evaluation.protocol import COMMANDS, NUM_VELOCITIES, draw_commands, evaluation_task, steps_per_draw
+
+Act = Callable[[TensorDict], Tensor]
+"""Actions (P, 32) for observations (P,)."""
+
+
+class PairedTrials:
+    """Two lots of P environments of one robot, equal to the last bit."""
+
+    def __init__(self, cfg: ExperimentCfg, make_env: MakeEnv, seed: int) -> None:
+        """Build both lots from ``cfg.search`` and the one robot of ``cfg``, in the physics of training."""
+        search, sim = cfg.search, cfg.task.sim
+        self._cfg, self._robot, self._seed = search, cfg.robots[0], seed
+        self._ev = EvaluationCfg(
+            num_steps=search.num_steps,
+            resampling_time_s=search.resampling_time_s,
+            physics_dt=sim.physics_dt,
+            decimation=sim.decimation,
+            randomization=search.randomization,
+            noise=search.randomization,
+        )
+        task = evaluation_task(cfg.task, self._ev)
+        self._ranges, self._device = task.commands, cfg.run.env_device
+        self._lots: tuple[Any, ...] = tuple(make_env(cfg.robots, search.num_pairs, task, seed) for _ in range(2))
+        worst = [max(map(abs, getattr(task.commands, name).finishing)) for name in COMMANDS]
+        self._fallen_errors = torch.tensor(worst, device=self._device)
+        self._units = torch.tensor(search.error_units, device=self._device)
+
+    @property
+    def steps(self) -> int:
+        """Environment steps of one lot's trial."""
+        return self._cfg.num_pairs * self._cfg.num_steps
+
+    def observations(self) -> TensorDict:
+        """What the first lot sees at the moment."""
+        return self._lots[0].get_observations()
+
+    def commands(self, number: int) -> Tensor:
+        """Commands of the trials of this number, some of them to stand, shape (P, draws, 5)."""
+        seed = self._seed + number
+        ev = dataclasses.replace(self._ev, seed=seed)
+        commands = draw_commands(self._ranges, ev, self._robot, self._cfg.num_pairs)
+        chance = torch.rand(commands.shape[:2], generator=torch.Generator().manual_seed(seed))
+        stands = chance < self._cfg.standing_probability
+        commands[..., :NUM_VELOCITIES] *= ~stands.unsqueeze(2)
+        return commands.float().to(self._device)
+
+    def follow(self, lot: int, commands: Tensor, act: Act) -> tuple[Tensor, Tensor]:
+        """Let one lot follow commands from rest.
+
+        Args:
+            lot: 0 or 1.
+            commands: shape (P, draws, 5).
+            act: the policies.
+
+        Returns:
+            Mean error over steps and commands in multiples of ``error_units``, (P,), in which every step after a fall
+            counts as the largest command there is; and who fell, bool (P,).
+        """
+        env = self._lots[lot]
+        env.pin_commands(commands[:, 0])
+        env.reset()
+        fell = torch.zeros(len(commands), dtype=torch.bool, device=self._device)
+        cost = torch.zeros(len(commands), device=self._device)
+        for t in range(self._cfg.num_steps):
+            if t % steps_per_draw(self._ev) == 0:
+                env.pin_commands(commands[:, t // steps_per_draw(self._ev)])
+                obs = env.get_observations()
+            obs, _, dones, extras = env.step(act(obs))
+            fell |= dones.bool() & ~extras["time_outs"].bool()
+            errors = torch.where(fell.unsqueeze(1), self._fallen_errors, env.tracking_errors().float())
+            if t >= self._cfg.settling_steps:
+                cost += (errors / self._units).mean(dim=1)
+        return cost / (self._cfg.num_steps - self._cfg.settling_steps), fell
+
+    def align(self) -> None:
+        """Give the second lot the state of the first, after a trial of the first alone."""
+        self._lots[1].load_state_dict(self._lots[0].state_dict())
+
+    def state_dict(self) -> list[dict[str, Any]]:
+        """State of both lots."""
+        return [lot.state_dict() for lot in self._lots]
+
+    def load_state_dict(self, state: list[dict[str, Any]]) -> None:
+        """Restore what :meth:`state_dict` returned."""
+        for lot, saved in zip(self._lots, state, strict=True):
+            lot.load_state_dict(saved)

@@ -1,0 +1,75 @@
+"""Pairs of trials, on robots whose errors are known in closed form."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import partial
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from eagle_rl.cli.environment import make_env_factory
+from eagle_rl.config.schema import ExperimentCfg, RunCfg, SearchCfg
+from eagle_rl.evaluation.trials import PairedTrials
+from tests.evaluation.fake import ScriptedEnv, idle, make_scripted_env, perfect
+
+UNITS = (0.1, 0.2, 0.5, 0.01, 0.04)
+SEARCH = SearchCfg(
+    num_pairs=32, num_steps=8, settling_steps=2, resampling_time_s=0.08, standing_probability=0.25, error_units=UNITS
+)
+CFG = ExperimentCfg(name="x", robots=("h1",), search=SEARCH)
+WORST = torch.tensor([1.2, 0.4, 1.0, 0.3, 0.5]) / torch.tensor(UNITS)
+"""The largest commands there are, in units."""
+
+
+def test_a_perfect_tracker_costs_nothing():
+    trials = PairedTrials(CFG, make_scripted_env, 1)
+    cost, fell = trials.follow(0, trials.commands(0), perfect)
+    assert (cost.max().item(), fell.any().item()) == (pytest.approx(0.0, abs=1e-6), False)
+
+
+def test_an_idle_robot_costs_its_commands_in_units():
+    trials = PairedTrials(CFG, make_scripted_env, 1)
+    commands = trials.commands(0)
+    cost, _ = trials.follow(1, commands, idle)
+    shares = (commands.abs() / torch.tensor(UNITS)).mean(dim=2)
+    expected = (2 * shares[:, 0] + 4 * shares[:, 1]) / 6
+    torch.testing.assert_close(cost, expected, msg="2 judged steps under the first command, 4 under the second")
+
+
+def test_every_step_after_a_fall_costs_the_largest_commands():
+    trials = PairedTrials(CFG, lambda *args: ScriptedEnv(args[1], args[2], fall_at=6), 1)
+    cost, fell = trials.follow(0, trials.commands(0), perfect)
+    assert fell.all()
+    torch.testing.assert_close(cost, (3 / 6 * WORST.mean()).expand(32), msg="3 of 6 judged steps: 6, 7 and 8")
+
+
+def test_each_number_has_commands_of_its_own_and_a_share_of_them_stands():
+    trials = PairedTrials(CFG, make_scripted_env, 1)
+    first, second = trials.commands(0), trials.commands(1)
+    assert first.shape == (32, 2, 5)
+    assert not torch.equal(first, second)
+    assert torch.equal(first, PairedTrials(CFG, make_scripted_env, 1).commands(0))
+    many = torch.cat([trials.commands(i) for i in range(40)])
+    stands = (many[..., :3] == 0).all(dim=2)
+    assert stands.float().mean().item() == pytest.approx(0.25, abs=0.03)
+    assert (many[..., 3:] != 0).all(), "who stands squats and leans all the same"
+
+
+@pytest.mark.parametrize("randomization", [False, True])
+def test_both_lots_of_a_real_robot_end_a_trial_alike_however_often(randomization):
+    search = dataclasses.replace(SEARCH, num_pairs=3, num_steps=30, resampling_time_s=0.3, randomization=randomization)
+    cfg = dataclasses.replace(CFG, search=search)
+    trials = PairedTrials(cfg, make_env_factory(RunCfg(num_threads=1)), 1)
+
+    def shake(obs: TensorDict, size: float) -> torch.Tensor:
+        return size * torch.sin(torch.arange(32.0)) * obs["slot_mask"] + 0.1 * obs["history"][:, :32]
+
+    trials.follow(0, trials.commands(9), partial(shake, size=0.1))
+    trials.align()
+    for number in range(2):
+        costs = [trials.follow(lot, trials.commands(number), partial(shake, size=0.2))[0] for lot in range(2)]
+        assert torch.equal(*costs), f"trial {number}: nothing but the policy may differ"
+    other = trials.follow(0, trials.commands(2), partial(shake, size=0.3))[0]
+    assert not torch.equal(trials.follow(1, trials.commands(2), partial(shake, size=0.2))[0], other)
