@@ -101,7 +101,7 @@ def _rounds(args: argparse.Namespace) -> dict[str, Figure]:
             scores = rounds_from_csv(path)
         else:
             judged = judged_stages(path, read_plan(path))
-            scores = read_rounds([(stage.round, stage.specialised, file) for stage, file in judged])
+            scores = read_rounds([(stage.position, stage.specialised, file) for stage, file in judged])
         figures[name] = plots.error_rounds(scores)
         _write(args.out / f"rounds_{name}.csv", rounds_to_csv(scores))
     return figures

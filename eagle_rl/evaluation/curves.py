@@ -48,7 +48,8 @@ class RoundScores:
     robot: str
     specialist: bool
     position: float
-    """Round of a generalist, 0 before the first; specialists stand half a round before the generalist they teach."""
+    """Round of a generalist, 0 before the first; specialists stand half a round before the generalist they teach, once
+    searched a quarter."""
     errors: tuple[float, ...]
     """Charged errors in the order of the five commands."""
 
@@ -103,17 +104,16 @@ def _curves(entries: Sequence[dict[str, float | str]], tag: str, smoothing: int)
             )
 
 
-def read_rounds(stages: Sequence[tuple[int, bool, Path]]) -> list[RoundScores]:
+def read_rounds(stages: Sequence[tuple[float, bool, Path]]) -> list[RoundScores]:
     """Scores of every judged stage of a run.
 
     Args:
-        stages: round, whether it is a specialist, and the file of its result, for every judged stage.
+        stages: position, whether it is a specialist, and the file of its result, for every judged stage.
     """
     scores = []
-    for number, specialist, path in stages:
+    for position, specialist, path in stages:
         for robot, metrics in EvaluationResult.read(path).robots.items():
             errors = tuple(math.nan if e is None else e for e in metrics.subsets["all"].charged)
-            position = number - 0.5 if specialist else float(number)
             scores.append(RoundScores(robot=robot, specialist=specialist, position=position, errors=errors))
     if not scores:
         raise ConfigError("No stage of the run has been judged: plan.judge_envs_per_robot is 0, or none is done yet.")

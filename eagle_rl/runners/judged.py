@@ -10,6 +10,7 @@ from eagle_rl.runners.checkpoint import read_manifest
 from eagle_rl.runners.plan import Stage
 from eagle_rl.runners.records import read_plan, read_record, stage_dir
 
+_POLICIES = {"specialist": "specialist", "residual": "specialist", "search": "searched specialist", "base": "base"}
 RESULT = "evaluation.json"
 """File in a stage's folder."""
 
@@ -24,8 +25,7 @@ def judged_results(run_dir: Path, stages: Sequence[Stage]) -> dict[str, list[Eva
     """Results as rows of a table: the generalist, then of each round its specialists and its generalist."""
     rows: dict[str, list[EvaluationResult]] = {}
     for stage, file in judged_stages(run_dir, stages):
-        policy = "specialist" if stage.specialised else "base" if stage.kind == "base" else "generalist"
-        label = f"{policy}, round {stage.round}" if stage.round else stage.name
+        label = f"{_POLICIES.get(stage.kind, 'generalist')}, round {stage.round}" if stage.round else stage.name
         rows.setdefault(label, []).append(EvaluationResult.read(file))
     return rows
 

@@ -58,6 +58,11 @@ class Stage:
         return self.kind != "generalist"
 
     @property
+    def position(self) -> float:
+        """Where its policy stands among the rounds: specialists before the generalist they teach, a search last."""
+        return self.round - {"specialist": 0.5, "residual": 0.5, "search": 0.25}.get(self.kind, 0.0)
+
+    @property
     def specialised(self) -> bool:
         """Whether it ends with a policy for one robot, out of a policy for all."""
         return self.kind in ALONE

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import torch
+from rich.console import Console
 from tensordict import TensorDict
 from torch import Tensor
 
@@ -82,7 +83,7 @@ class SearchRunner:
         """A search along the principal directions of the last hidden layer, as the policy moves it."""
         hidden: list[Tensor] = []
 
-        def act(obs: TensorDict) -> Tensor:
+        def act(obs: TensorDict, segment: int) -> Tensor:
             hidden.append(self._actor.hidden(obs))
             return self._actor(obs)
 
@@ -119,27 +120,26 @@ class SearchRunner:
         Perturbations that are too large for a robot find what is best under perturbations.
         """
         commands = self._trials.commands(self.stage.iterations + 1)
-        found, nothing = search.parameters, torch.zeros_like(search.parameters)
-        before, after = (
-            self._trials.follow(i, commands, self._changed(search, x.expand(self.cfg.search.num_pairs, -1, -1)))[
-                0
-            ].mean()
-            for i, x in enumerate((nothing, found))
-        )
+        nothing = torch.zeros_like(search.parameters)
+        costs = []
+        for lot, parameters in enumerate((nothing, search.parameters)):
+            everywhere = parameters.expand(self.cfg.search.num_pairs, self.cfg.search.num_segments, -1, -1)
+            costs.append(self._trials.follow(lot, commands, self._changed(search, everywhere))[0].mean().item())
         self.env_steps += 2 * self._trials.steps
-        if after >= before:
+        before, after = costs
+        outcome = f"{self.stage.name}: cost {before:.3f} -> {after:.3f} on commands that were not searched on"
+        if after < before:
+            Console(stderr=True).print(outcome, highlight=False)
+        else:
             search.parameters = nothing
-            text = (
-                f"{self.stage.name}: nothing better found; cost {before:.3f} -> {after:.3f}. Try a smaller search.std."
-            )
-            warnings.warn(text, EagleWarning, stacklevel=2)
+            warnings.warn(f"{outcome}: nothing better found. Try a smaller search.std.", EagleWarning, stacklevel=2)
 
     def _changed(self, search: LastLayerSearch, parameters: Tensor) -> Act:
-        """The policy with other parameters (P, S, D + 1) in each environment."""
+        """The policy with other parameters (P, G, S, D + 1) in each environment and segment."""
 
-        def act(obs: TensorDict) -> Tensor:
+        def act(obs: TensorDict, segment: int) -> Tensor:
             hidden = self._actor.hidden(obs)
-            return search.change(parameters, hidden, self._actor.mlp[-1](hidden)) * obs["slot_mask"]
+            return search.change(parameters[:, segment], hidden, self._actor.mlp[-1](hidden)) * obs["slot_mask"]
 
         return act
 

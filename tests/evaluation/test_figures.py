@@ -147,12 +147,12 @@ def judged(tmp_path, name: str, robots: list[str]):
     return path
 
 
-def test_specialists_stand_half_a_round_before_the_generalist_they_teach(tmp_path):
+def test_every_judged_stage_stands_at_its_position_with_each_of_its_robots(tmp_path):
     scores = read_rounds(
         [
-            (0, False, judged(tmp_path, "generalist.json", ["h1", "g1"])),
-            (1, True, judged(tmp_path, "h1.json", ["h1"])),
-            (1, False, judged(tmp_path, "distill.json", ["h1", "g1"])),
+            (0.0, False, judged(tmp_path, "generalist.json", ["h1", "g1"])),
+            (0.5, True, judged(tmp_path, "h1.json", ["h1"])),
+            (1.0, False, judged(tmp_path, "distill.json", ["h1", "g1"])),
         ]
     )
     assert [(s.robot, s.position) for s in scores] == [("h1", 0), ("g1", 0), ("h1", 0.5), ("h1", 1), ("g1", 1)]

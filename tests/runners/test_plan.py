@@ -47,6 +47,15 @@ def test_a_search_follows_each_specialists_training_and_ends_with_the_teacher():
     assert search.specialised
 
 
+def test_specialists_stand_half_a_round_before_the_generalist_they_teach_searched_ones_a_quarter():
+    stages = {stage.name: stage.position for stage in plan(search_env_steps=1)}
+    assert stages["generalist"] == 0
+    names = ("specialist_g1", "search_g1", "distill")
+    assert [stages[f"round2/{name}"] for name in names] == [1.5, 1.75, 2]
+    residual = {stage.name: stage.position for stage in plan(method="compass")}["compass/residual_g1"]
+    assert residual == 0.5
+
+
 def test_a_search_alone_starts_from_the_generalist():
     stages = {stage.name: stage for stage in plan(specialist_env_steps=0, search_env_steps=10)}
     assert not [name for name in stages if "specialist" in name]
