@@ -78,7 +78,7 @@ class LastLayerSearch:
         return cls(cfg, slots=slots, mean=mean, directions=scaled, num_generations=num_generations, seed=seed)
 
     def pairs(self) -> tuple[Tensor, Tensor]:
-        """Parameters to try, one way and the other, each of shape (P, G, S, D + 1); the same until :meth:`learn`."""
+        """Parameters to try, one way and the other, each of shape (P, S, D + 1); the same until :meth:`learn`."""
         step = self.cfg.std * self._noise()
         return self.parameters + step, self.parameters - step
 
@@ -86,11 +86,11 @@ class LastLayerSearch:
         """Take a step.
 
         Args:
-            better: by how much the cost of each first half is below that of its second half, shape (P, G).
+            better: by how much the cost of each first half is below that of its second half, shape (P,).
         """
         bound = OUTLIER * better.abs().median()
         weights = better.clamp(-bound, bound)
-        gradient = torch.einsum("pg,pgsd->sd", weights, self._noise())
+        gradient = torch.einsum("p,psd->sd", weights, self._noise())
         gradient /= gradient.norm().clamp(min=1e-12)
         self.momentum = MOMENTUM * self.momentum + (1.0 - MOMENTUM) * gradient
         left = 1.0 - (1.0 - FINAL_STEP) * self.generation / self.num_generations
@@ -112,10 +112,9 @@ class LastLayerSearch:
         last.bias[self.slots] += self.parameters[:, -1] - weight @ self.mean
 
     def _noise(self) -> Tensor:
-        """Normal numbers of this generation, (P, G, S, D + 1)."""
+        """Normal numbers of this generation, (P, S, D + 1)."""
         generator = torch.Generator().manual_seed(self.seed + self.generation)
-        shape = (self.cfg.num_pairs, self.cfg.num_segments, *self.parameters.shape)
-        noise = torch.randn(shape, generator=generator)
+        noise = torch.randn(self.cfg.num_pairs, *self.parameters.shape, generator=generator)
         return noise.to(self.parameters)
 
     def state_dict(self) -> dict[str, Any]:

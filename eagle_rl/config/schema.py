@@ -465,8 +465,6 @@ class SearchCfg:
     """Control steps each of them is given, from rest."""
     settling_steps: int = 40
     """The first of them, which are not judged."""
-    num_segments: int = 4
-    """Equal parts of the others, each of which tries changes of its own [-]: a gait answers to one in a few steps."""
     resampling_time_s: float = 2.4
     """Time between commands [s]; 0 keeps the first."""
     standing_probability: float = 0.2

@@ -14,8 +14,8 @@ from eagle_rl.config.schema import EvaluationCfg, ExperimentCfg
 from eagle_rl.evaluation.evaluate import MakeEnv
 from eagle_rl.evaluation.protocol import COMMANDS, NUM_VELOCITIES, draw_commands, evaluation_task, steps_per_draw
 
-Act = Callable[[TensorDict, int], Tensor]
-"""Actions (P, 32) for observations (P,) in a segment of the trial, counted from 0."""
+Act = Callable[[TensorDict], Tensor]
+"""Actions (P, 32) for observations (P,)."""
 
 
 class PairedTrials:
@@ -68,26 +68,24 @@ class PairedTrials:
             act: the policies.
 
         Returns:
-            Mean error over the steps of each segment and over commands in multiples of ``error_units``, (P, G), in
-            which every step after a fall counts as the largest command there is; and who fell, bool (P,).
+            Mean error over steps and commands in multiples of ``error_units``, (P,), in which every step after a fall
+            counts as the largest command there is; and who fell, bool (P,).
         """
-        env, search = self._lots[lot], self._cfg
+        env = self._lots[lot]
         env.pin_commands(commands[:, 0])
         env.reset()
         fell = torch.zeros(len(commands), dtype=torch.bool, device=self._device)
-        cost = torch.zeros(len(commands), search.num_segments, device=self._device)
-        length = (search.num_steps - search.settling_steps) // search.num_segments
-        for t in range(search.num_steps):
-            segment = max(0, t - search.settling_steps) // length
+        cost = torch.zeros(len(commands), device=self._device)
+        for t in range(self._cfg.num_steps):
             if t % steps_per_draw(self._ev) == 0:
                 env.pin_commands(commands[:, t // steps_per_draw(self._ev)])
                 obs = env.get_observations()
-            obs, _, dones, extras = env.step(act(obs, segment))
+            obs, _, dones, extras = env.step(act(obs))
             fell |= dones.bool() & ~extras["time_outs"].bool()
             errors = torch.where(fell.unsqueeze(1), self._fallen_errors, env.tracking_errors().float())
-            if t >= search.settling_steps:
-                cost[:, segment] += (errors / self._units).mean(dim=1) / length
-        return cost, fell
+            if t >= self._cfg.settling_steps:
+                cost += (errors / self._units).mean(dim=1)
+        return cost / (self._cfg.num_steps - self._cfg.settling_steps), fell
 
     def align(self) -> None:
         """Give the second lot the state of the first, after a trial of the first alone."""

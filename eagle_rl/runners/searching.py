@@ -83,7 +83,7 @@ class SearchRunner:
         """A search along the principal directions of the last hidden layer, as the policy moves it."""
         hidden: list[Tensor] = []
 
-        def act(obs: TensorDict, segment: int) -> Tensor:
+        def act(obs: TensorDict) -> Tensor:
             hidden.append(self._actor.hidden(obs))
             return self._actor(obs)
 
@@ -123,7 +123,7 @@ class SearchRunner:
         nothing = torch.zeros_like(search.parameters)
         costs = []
         for lot, parameters in enumerate((nothing, search.parameters)):
-            everywhere = parameters.expand(self.cfg.search.num_pairs, self.cfg.search.num_segments, -1, -1)
+            everywhere = parameters.expand(self.cfg.search.num_pairs, -1, -1)
             costs.append(self._trials.follow(lot, commands, self._changed(search, everywhere))[0].mean().item())
         self.env_steps += 2 * self._trials.steps
         before, after = costs
@@ -135,11 +135,11 @@ class SearchRunner:
             warnings.warn(f"{outcome}: nothing better found. Try a smaller search.std.", EagleWarning, stacklevel=2)
 
     def _changed(self, search: LastLayerSearch, parameters: Tensor) -> Act:
-        """The policy with other parameters (P, G, S, D + 1) in each environment and segment."""
+        """The policy with other parameters (P, S, D + 1) in each environment."""
 
-        def act(obs: TensorDict, segment: int) -> Tensor:
+        def act(obs: TensorDict) -> Tensor:
             hidden = self._actor.hidden(obs)
-            return search.change(parameters[:, segment], hidden, self._actor.mlp[-1](hidden)) * obs["slot_mask"]
+            return search.change(parameters, hidden, self._actor.mlp[-1](hidden)) * obs["slot_mask"]
 
         return act
 

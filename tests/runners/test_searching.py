@@ -38,9 +38,7 @@ def make_still_env(robots: Sequence[str], num_envs: int, task: TaskCfg, seed: in
 
 
 def searched(tmp_path: Path, std: float) -> tuple[ExperimentCfg, RunResult]:
-    search = SearchCfg(
-        num_pairs=64, num_steps=5, settling_steps=1, num_segments=1, resampling_time_s=0.0, std=std, step=0.5
-    )
+    search = SearchCfg(num_pairs=64, num_steps=5, settling_steps=1, resampling_time_s=0.0, std=std, step=0.5)
     plan = toy_experiment(iterations=1, specialist_env_steps=0, search_env_steps=30 * 640)
     cfg = dataclasses.replace(plan, search=search)
     return cfg, run_experiment(cfg, tmp_path / "run", make_still_env)
@@ -52,10 +50,7 @@ def test_a_search_makes_robots_follow_better_and_touches_nothing_but_the_last_la
     for name in cfg.robots:
         actor = load_actor(final_checkpoint(result.run_dir, f"round1/search_{name}"))[0]
         trials = PairedTrials(dataclasses.replace(cfg, robots=(name,)), make_still_env, seed=99)
-        before, after = (
-            trials.follow(i, trials.commands(0), lambda obs, segment, x=x: x(obs))[0].mean().item()
-            for i, x in enumerate((root, actor))
-        )
+        before, after = (trials.follow(i, trials.commands(0), x)[0].mean().item() for i, x in enumerate((root, actor)))
         assert after < 0.7 * before, f"{name}, on commands that were not searched on"
         differ = [k for k, x in actor.state_dict().items() if not torch.equal(x, root.state_dict()[k])]
         assert differ == ["mlp.2.weight", "mlp.2.bias"], name
