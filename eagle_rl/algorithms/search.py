@@ -32,9 +32,8 @@ OUTLIER = 3.0
 class LastLayerSearch:
     """Parameters (S, D + 1): what D directions of the last hidden layer, and a constant, add to S actions.
 
-    The directions are the principal ones of the activations a policy has when it walks, each scaled to unit variance.
-    What is added counts in multiples of the noise the policy explored with, which PPO has made small where little
-    spoils much: on H1 arms bear four times as much as hips. So one step length fits all of them.
+    The directions are the principal ones of the activations a policy has when it walks, each scaled to unit variance,
+    so that one step length fits them all; S are the joints the robot has.
     """
 
     def __init__(
@@ -44,7 +43,6 @@ class LastLayerSearch:
         slots: Tensor,
         mean: Tensor,
         directions: Tensor,
-        noise: Tensor,
         num_generations: int,
         seed: int,
         parameters: Tensor | None = None,
@@ -58,41 +56,30 @@ class LastLayerSearch:
             slots: slots that are changed, shape (S,).
             mean: of the hidden activations, shape (H,).
             directions: shape (D, H); a direction times an activation less the mean has unit variance.
-            noise: standard deviation of the policy's actions in these slots, shape (S,).
             num_generations: over how many generations steps shrink.
             seed: of the perturbations.
             parameters: shape (S, D + 1).
             momentum: the same.
             generation: how many are done.
         """
-        self.cfg, self.slots, self.mean, self.directions, self.noise = cfg, slots, mean, directions, noise
+        self.cfg, self.slots, self.mean, self.directions = cfg, slots, mean, directions
         self.num_generations, self.seed, self.generation = num_generations, seed, generation
         zeros = mean.new_zeros(len(slots), len(directions) + 1)
         self.parameters = zeros if parameters is None else parameters
         self.momentum = zeros if momentum is None else momentum
 
     @classmethod
-    def along(
-        cls, cfg: SearchCfg, hidden: Tensor, slots: Tensor, noise: Tensor, num_generations: int, seed: int
-    ) -> LastLayerSearch:
-        """A search along the principal directions of hidden activations (M, H); the rest as above."""
+    def along(cls, cfg: SearchCfg, hidden: Tensor, slots: Tensor, num_generations: int, seed: int) -> LastLayerSearch:
+        """A search along the principal directions of hidden activations (M, H)."""
         mean = hidden.mean(dim=0)
         _, spread, directions = torch.linalg.svd(hidden - mean, full_matrices=False)
         keep = min(cfg.num_directions, int((spread > MIN_SPREAD * spread[0]).sum()))
         scaled = directions[:keep] * (math.sqrt(len(hidden)) / spread[:keep].unsqueeze(1))
-        return cls(
-            cfg,
-            slots=slots,
-            mean=mean,
-            directions=scaled,
-            noise=noise,
-            num_generations=num_generations,
-            seed=seed,
-        )
+        return cls(cfg, slots=slots, mean=mean, directions=scaled, num_generations=num_generations, seed=seed)
 
     def pairs(self) -> tuple[Tensor, Tensor]:
         """Parameters to try, one way and the other, each of shape (P, S, D + 1); the same until :meth:`learn`."""
-        step = self.cfg.std * self._samples()
+        step = self.cfg.std * self._noise()
         return self.parameters + step, self.parameters - step
 
     def learn(self, better: Tensor) -> None:
@@ -103,7 +90,7 @@ class LastLayerSearch:
         """
         bound = OUTLIER * better.abs().median()
         weights = better.clamp(-bound, bound)
-        gradient = torch.einsum("p,psd->sd", weights, self._samples())
+        gradient = torch.einsum("p,psd->sd", weights, self._noise())
         gradient /= gradient.norm().clamp(min=1e-12)
         self.momentum = MOMENTUM * self.momentum + (1.0 - MOMENTUM) * gradient
         left = 1.0 - (1.0 - FINAL_STEP) * self.generation / self.num_generations
@@ -114,23 +101,23 @@ class LastLayerSearch:
     def change(self, parameters: Tensor, hidden: Tensor, actions: Tensor) -> Tensor:
         """Actions (P, 32) with what parameters (P, S, D + 1), one of each environment, make of its activations."""
         inputs = torch.nn.functional.pad((hidden - self.mean) @ self.directions.T, (0, 1), value=1.0)
-        return actions.index_add(1, self.slots, self.noise * (parameters @ inputs.unsqueeze(2)).squeeze(2))
+        return actions.index_add(1, self.slots, (parameters @ inputs.unsqueeze(2)).squeeze(2))
 
     @torch.no_grad()
     def fold_into(self, actor: EagleActor) -> None:
         """Add the present parameters to an actor's last layer: it then acts as ``change`` had it act."""
         last = actor.mlp[-1]
-        parameters = self.noise.unsqueeze(1) * self.parameters
-        weight = parameters[:, :-1] @ self.directions
+        weight = self.parameters[:, :-1] @ self.directions
         last.weight[self.slots] += weight
-        last.bias[self.slots] += parameters[:, -1] - weight @ self.mean
+        last.bias[self.slots] += self.parameters[:, -1] - weight @ self.mean
 
-    def _samples(self) -> Tensor:
+    def _noise(self) -> Tensor:
         """Normal numbers of this generation, (P, S, D + 1)."""
         generator = torch.Generator().manual_seed(self.seed + self.generation)
-        return torch.randn(self.cfg.num_pairs, *self.parameters.shape, generator=generator).to(self.parameters)
+        noise = torch.randn(self.cfg.num_pairs, *self.parameters.shape, generator=generator)
+        return noise.to(self.parameters)
 
     def state_dict(self) -> dict[str, Any]:
         """Arguments of the constructor, besides the configuration."""
-        names = "slots mean directions noise num_generations seed parameters momentum generation".split()
+        names = "slots mean directions num_generations seed parameters momentum generation".split()
         return {name: getattr(self, name) for name in names}

@@ -471,8 +471,8 @@ class SearchCfg:
     """Share of commands without velocity [-]."""
     num_directions: int = 24
     """Principal directions of the last hidden layer that are searched, for each joint [-]."""
-    std: float = 0.2
-    """Perturbation of an action by each direction, in multiples of the policy's noise [-]."""
+    std: float = 0.015
+    """Perturbation of an action by each direction [-]."""
     step: float = 0.125
     """Length of the first step as a share of that of a perturbation [-]; the last one is a fifth of it."""
     error_units: tuple[float, float, float, float, float] = (0.05, 0.08, 0.05, 0.02, 0.04)

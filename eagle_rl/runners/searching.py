@@ -91,9 +91,7 @@ class SearchRunner:
         self._trials.align()
         self.env_steps += self._trials.steps
         live = self._trials.observations()["slot_mask"][0].nonzero().flatten()
-        noise = self._actor.distribution.std_param[live]
-        settings = (self.stage.iterations, self.stage.seed)
-        return LastLayerSearch.along(self.cfg.search, torch.cat(hidden), live, noise, *settings)
+        return LastLayerSearch.along(self.cfg.search, torch.cat(hidden), live, self.stage.iterations, self.stage.seed)
 
     @torch.no_grad()
     def _generation(self, search: LastLayerSearch) -> dict[str, float]:

@@ -14,7 +14,6 @@ from tests.learner.helpers import make_runner
 
 CFG = SearchCfg(num_pairs=64, num_directions=3, std=0.02, step=0.5)
 SLOTS = torch.tensor([0, 2, 5])
-NOISE = torch.tensor([0.05, 0.1, 0.3])
 GENERATIONS = 50
 
 
@@ -27,7 +26,7 @@ def hidden() -> Tensor:
 
 @pytest.fixture
 def search(hidden) -> LastLayerSearch:
-    return LastLayerSearch.along(CFG, hidden, SLOTS, NOISE, GENERATIONS, seed=7)
+    return LastLayerSearch.along(CFG, hidden, SLOTS, GENERATIONS, seed=7)
 
 
 def test_directions_have_unit_variance_and_do_not_correlate(search, hidden):
@@ -38,7 +37,7 @@ def test_directions_have_unit_variance_and_do_not_correlate(search, hidden):
 
 def test_directions_that_hardly_move_are_left_out(hidden):
     many = SearchCfg(num_directions=64)
-    search = LastLayerSearch.along(many, hidden, SLOTS, NOISE, GENERATIONS, seed=7)
+    search = LastLayerSearch.along(many, hidden, SLOTS, GENERATIONS, seed=7)
     assert len(search.directions) == 4, "the last two move less than a hundredth as far as the first"
 
 
@@ -83,7 +82,7 @@ def test_one_fall_does_not_decide_a_step(hidden):
     moderate[0], absurd[0] = 3.0, 1e6
     steps = []
     for differences in (moderate, absurd):
-        search = LastLayerSearch.along(CFG, hidden, SLOTS, NOISE, GENERATIONS, seed=7)
+        search = LastLayerSearch.along(CFG, hidden, SLOTS, GENERATIONS, seed=7)
         search.learn(differences)
         steps.append(search.parameters)
     assert torch.equal(*steps), "beyond three medians all differences are the same"
@@ -95,18 +94,11 @@ def test_pairs_that_make_no_difference_move_nothing(search):
     assert torch.isfinite(search.momentum).all()
 
 
-def test_what_is_added_counts_in_multiples_of_the_noise(search, hidden):
-    ones = torch.ones(len(hidden), *search.parameters.shape)
-    added = search.change(ones, hidden, torch.zeros(len(hidden), 32))[:, SLOTS]
-    torch.testing.assert_close(added / NOISE, (added / NOISE)[:, :1].expand(-1, 3))
-    assert added[:, 0].std().item() == pytest.approx(0.05 * math.sqrt(3), rel=0.01), "three directions of unit variance"
-
-
 def test_what_was_found_is_in_the_weights():
     runner = make_runner()
     actor, obs = runner.alg.actor, runner.env.get_observations()
     hidden = actor.hidden(obs).detach()
-    search = LastLayerSearch.along(CFG, hidden, SLOTS, NOISE, GENERATIONS, seed=7)
+    search = LastLayerSearch.along(CFG, hidden, SLOTS, GENERATIONS, seed=7)
     search.parameters = torch.randn(search.parameters.shape, generator=torch.Generator().manual_seed(1))
     everywhere = search.parameters.expand(len(obs), -1, -1)
     before = actor(obs).detach()
