@@ -7,16 +7,17 @@ import inspect
 from functools import cache
 from typing import Any
 
-from . import schema
+from . import schema, task_schema
 
 
 @cache
 def _all_docs() -> dict[str, dict[str, str]]:
     """Docstring after each field, by class and field name."""
     docs: dict[str, dict[str, str]] = {}
-    for node in ast.parse(inspect.getsource(schema)).body:
-        if isinstance(node, ast.ClassDef):
-            docs[node.name] = _class_docs(node)
+    for module in (task_schema, schema):
+        for node in ast.parse(inspect.getsource(module)).body:
+            if isinstance(node, ast.ClassDef):
+                docs[node.name] = _class_docs(node)
     return docs
 
 
