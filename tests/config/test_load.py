@@ -172,6 +172,8 @@ def test_a_wrong_override_is_named_with_what_was_expected(override, expected):
         ("robots=[]", "robots: expected at least one robot"),
         ("robots=[h1, g1, h1]", "named twice: h1"),
         ("plan.method=eagle", "needs a budget for this stage"),
+        ("search.num_steps=40", "search.num_steps: got 40, expected more than search.settling_steps, 40"),
+        ("search.error_units=[0.05, 0.08, 0, 0.02, 0.04]", "expected numbers above 0"),
         ("run.device=tpu", "expected cpu, cuda or cuda:N"),
         ("name=../escape", "it names the run's folder"),
     ],
@@ -180,6 +182,13 @@ def test_an_impossible_value_is_named_with_its_bound(override, expected):
     faults = faults_of(override)
     assert all(f.startswith("command line: ") for f in faults)
     assert any(expected in fault for fault in faults), faults
+
+
+def test_a_search_may_take_the_place_of_specialists_training_but_not_of_residuals():
+    overrides = ["plan.specialist_env_steps=0", "plan.search_env_steps=9"]
+    assert load_experiment("eagle", overrides).plan.search_env_steps == 9
+    with pytest.raises(ConfigError, match=r"plan.specialist_env_steps: 0, but method compass needs a budget"):
+        load_experiment("fork_compass", overrides)
 
 
 def test_every_bound_is_that_of_a_key():
