@@ -67,11 +67,12 @@ PLOT = $(BIN)/eagle plot
 LATENTS ?= $(POLICY).safetensors
 
 results: $(INSTALLED)
-	rm -rf $(RESULTS)/joint $(RESULTS)/single $(RESULTS)/standing $(RESULTS)/stopping
+	rm -rf $(RESULTS)/joint $(RESULTS)/single $(RESULTS)/standing $(RESULTS)/stopping $(RESULTS)/redrawn
 	$(EVALUATE) --protocol joint --out $(RESULTS)/joint
 	$(EVALUATE) --protocol single --out $(RESULTS)/single
 	$(EVALUATE) --protocol standing --out $(RESULTS)/standing
 	$(EVALUATE) --protocol standing --resample 4 --out $(RESULTS)/stopping
+	$(EVALUATE) --protocol joint --resample 4 --out $(RESULTS)/redrawn
 	$(PLOT) estimator $(POLICY).safetensors --envs $(RESULT_ENVS) --out $(RESULTS)
 	$(PLOT) robustness $(POLICY).safetensors --envs $(SWEEP_ENVS) --out $(RESULTS)
 	$(PLOT) bodies $(POLICY).safetensors --envs $(SWEEP_ENVS) --out $(RESULTS)
