@@ -197,6 +197,7 @@ MUTANTS: tuple[Mutant, ...] = (
         "self.parameters - step, self.parameters + step",
         "learner/test_search.py",
     ),
+    Mutant(SEARCHING, "cost[1] - cost[0]", "cost[0] - cost[1]", "runners/test_searching.py"),
     Mutant(SEARCH, "better.clamp(-bound, bound)", "better", "learner/test_search.py"),
     Mutant(SEARCH, "- weight @ self.mean", "", "learner/test_search.py"),
     Mutant(
