@@ -25,6 +25,8 @@ LEARNING_TAGS = {
     "$E_p$ [rad]": "Metrics/E_p",
     "feet that match the clock [-]": "Metrics/contact_match",
     "harness [share of full]": "Curriculum/harness",
+    "cost in a search": "Search/cost",
+    "survival in a search": "Search/survival",
     "$L_a$": "Distill/L_a",
     "$L_e$": "Distill/L_e",
 }

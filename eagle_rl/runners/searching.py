@@ -104,14 +104,14 @@ class SearchRunner:
         seconds, steps = time.perf_counter() - start, 2 * self._trials.steps
         self.env_steps += steps
         self.wall_time += seconds
-        return {
-            "Search/cost": cost.mean().item(),
-            "Search/survival": 1.0 - fell.float().mean().item(),
+        found = {"Search/cost": cost.mean().item(), "Search/survival": 1.0 - fell.float().mean().item()}
+        performance = {
             "Perf/total_fps": steps / seconds,
             "Perf/busy_cores": (time.process_time() - cpu_start) / seconds,
             "Perf/env_steps": self.env_steps,
             "Perf/wall_time": self.wall_time,
         }
+        return performance | found | {f"{tag}/{self.cfg.robots[0]}": value for tag, value in found.items()}
 
     @torch.no_grad()
     def _drop_if_worse(self, search: LastLayerSearch) -> None:

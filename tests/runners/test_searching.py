@@ -12,6 +12,7 @@ import torch
 
 from eagle_rl.config.schema import ExperimentCfg, SearchCfg, TaskCfg
 from eagle_rl.errors import EagleWarning
+from eagle_rl.evaluation.curves import read_curves
 from eagle_rl.evaluation.trials import PairedTrials
 from eagle_rl.runners.checkpoint import load_actor
 from eagle_rl.runners.plan import plan_stages
@@ -76,7 +77,10 @@ def test_a_search_logs_every_generation_and_its_checkpoints_start_other_stages(t
     folder = stage_dir(result.run_dir, "round1/search_two")
     lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
     assert [line["iteration"] for line in lines] == [1, 2, 3]
-    assert all(line["Search/cost"] > 0 and 0 <= line["Search/survival"] <= 1 for line in lines)
+    assert read_curves(folder / "metrics.jsonl").keys() == {"cost in a search", "survival in a search"}
+    assert all(
+        line["Search/cost"] == line["Search/cost/two"] > 0 and 0 <= line["Search/survival"] <= 1 for line in lines
+    )
     assert lines[-1]["Perf/env_steps"] == GENERATION * 3 + GENERATION / 2, "a look before"
     assert result.records["round1/distill"].state == "done"
 
