@@ -39,10 +39,10 @@ def test_distillation_has_one_teacher_per_robot_in_order():
 
 
 def test_a_search_follows_each_specialists_training_and_ends_with_the_teacher():
-    stages = {stage.name: stage for stage in plan(search_env_steps=2 * 256 * 160 + 1)}
+    stages = {stage.name: stage for stage in plan(search_env_steps=2 * 192 * 240 + 1)}
     search = stages["round2/search_g1"]
     assert search.inputs == ("round2/specialist_g1",)
-    assert search.iterations == 2, "generations of 256 pairs and 160 steps"
+    assert search.iterations == 2, "generations of 192 pairs and 240 steps"
     assert stages["round2/distill"].teachers[1] == search.name
     assert search.specialised
 
