@@ -134,6 +134,9 @@ class PlanCfg:
     robot's share of the pool, and its iterations fewer (ours)."""
     distill_env_steps: int = 0
     """Budget of each distillation, per round."""
+    start_share: float = 0.0
+    """Share of the weights a round started from in those it ends with; the rest are the distilled ones. Halves of both
+    follow as well as the latter and fall less when disturbed (ours; docs/experiments.md, 20)."""
     base_env_steps: int = 0
     """Budget of COMPASS's base policy, which imitates the root; 0 makes the root itself its base."""
     max_rounds: int = 1

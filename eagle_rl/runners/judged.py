@@ -10,7 +10,13 @@ from eagle_rl.runners.checkpoint import read_manifest
 from eagle_rl.runners.plan import Stage
 from eagle_rl.runners.records import read_plan, read_record, stage_dir
 
-_POLICIES = {"specialist": "specialist", "residual": "specialist", "search": "searched specialist", "base": "base"}
+_POLICIES = {
+    "specialist": "specialist",
+    "residual": "specialist",
+    "search": "searched specialist",
+    "base": "base",
+    "average": "averaged",
+}
 RESULT = "evaluation.json"
 """File in a stage's folder."""
 

@@ -1,8 +1,8 @@
 """Algorithm 1 of the paper as data: which stages an experiment consists of, what each starts from and what it costs.
 
 Line 1 of the algorithm is the stage ``generalist`` (or ``root``, when the experiment forks from a checkpoint); lines
-3-4 are ``roundR/specialist_ROBOT`` and, ours, ``roundR/search_ROBOT``; lines 5-9 are ``roundR/distill``. Nothing here
-imports torch.
+3-4 are ``roundR/specialist_ROBOT`` and, ours, ``roundR/search_ROBOT``; lines 5-9 are ``roundR/distill`` and, ours,
+``roundR/average``. Nothing here imports torch.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Literal
 
 from eagle_rl.config.schema import ExperimentCfg, TaskCfg
 
-Kind = Literal["root", "generalist", "continued", "specialist", "search", "distill", "base", "residual"]
+Kind = Literal["root", "generalist", "continued", "specialist", "search", "distill", "average", "base", "residual"]
 Imitation = Literal["eagle", "kickstart"]
 
 ALONE: tuple[Kind, ...] = ("specialist", "search", "residual")
@@ -39,6 +39,8 @@ class Stage:
     teachers: tuple[str, ...] = ()
     """The stage that ended each robot's specialist, in the order of ``robots``."""
     imitation: Imitation | None = None
+    start: str | None = None
+    """Stage whose weights those of ``init`` are averaged with."""
     base: str | None = None
     """Stage whose policy's actions the specialists' are added to (COMPASS)."""
     demonstrations: bool = False
@@ -50,7 +52,9 @@ class Stage:
     @property
     def inputs(self) -> tuple[str, ...]:
         """Stages that must be done first."""
-        return tuple(dict.fromkeys(name for name in (self.init, self.base, *self.teachers) if name is not None))
+        return tuple(
+            dict.fromkeys(name for name in (self.init, self.start, self.base, *self.teachers) if name is not None)
+        )
 
     @property
     def warm(self) -> bool:
@@ -59,8 +63,8 @@ class Stage:
 
     @property
     def position(self) -> float:
-        """Where its policy stands among the rounds: specialists before the generalist they teach, a search last."""
-        return self.round - {"specialist": 0.5, "residual": 0.5, "search": 0.25}.get(self.kind, 0.0)
+        """Where its policy stands among the rounds: specialists before the generalist they teach, an average after."""
+        return self.round - {"specialist": 0.5, "residual": 0.5, "search": 0.25, "average": -0.2}.get(self.kind, 0.0)
 
     @property
     def specialised(self) -> bool:
@@ -122,7 +126,9 @@ def _round(cfg: ExperimentCfg, number: int, generalist: str) -> list[Stage]:
         teachers=tuple(stages[-1].name for stages in specialists),
         imitation="kickstart" if cfg.plan.method == "kickstarting" else "eagle",
     )
-    return [*(stage for stages in specialists for stage in stages), distill]
+    average = _stage(cfg, f"round{number}/average", "average", 0, round=number, init=distill.name, start=generalist)
+    ends = [distill, average] if cfg.plan.start_share else [distill]
+    return [*(stage for stages in specialists for stage in stages), *ends]
 
 
 def _compass(cfg: ExperimentCfg, demonstrator: str) -> list[Stage]:

@@ -130,7 +130,7 @@ def read_tolerance(run_dir: Path) -> float:
 
 def converged_round(stages: Sequence[Stage], records: Mapping[str, Record], tolerance: float) -> int | None:
     """First round whose distillation improved the pooled score by less than ``tolerance``, or None so far."""
-    scores = {s.round: records[s.name].score for s in stages if s.kind in ("root", "generalist", "distill")}
+    scores = {s.round: records[s.name].score for s in stages if s.kind in ("root", "generalist", "distill", "average")}
     for number in sorted(scores):
         before, after = scores.get(number - 1), scores[number]
         if before is not None and after is not None and before - after < tolerance * before:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
 from rich.console import Console
 from rsl_rl.env import VecEnv
 
@@ -17,9 +18,16 @@ from eagle_rl.config.schema import ExperimentCfg
 from eagle_rl.errors import CheckpointError
 from eagle_rl.evaluation.evaluate import MakeEnv, Policy
 from eagle_rl.models import EagleActor
-from eagle_rl.runners.checkpoint import latest_checkpoint, load_actor, load_checkpoint, read_manifest, verify_checkpoint
+from eagle_rl.runners.checkpoint import (
+    latest_checkpoint,
+    load_actor,
+    load_checkpoint,
+    read_manifest,
+    save_checkpoint,
+    verify_checkpoint,
+)
 from eagle_rl.runners.compass import DemonstrationEnv, ResidualBank, ResidualEnv, ResidualPolicy, begin_residual
-from eagle_rl.runners.files import write_atomically
+from eagle_rl.runners.files import patiently, write_atomically
 from eagle_rl.runners.locate import find_checkpoint
 from eagle_rl.runners.on_policy import EagleRunner, make_train_cfg
 from eagle_rl.runners.plan import Stage, stage_num_envs, warm_task
@@ -41,6 +49,8 @@ class Job:
     """Checkpoint whose weights to start from."""
     teachers: tuple[Path, ...]
     """Final checkpoint of each robot's specialist."""
+    start: Path | None
+    """Checkpoint whose weights those of ``init`` are averaged with."""
     base: Path | None
     """Checkpoint of the policy whose actions the specialists' are added to."""
     make_env: MakeEnv
@@ -71,6 +81,8 @@ def train(job: Job) -> Path:
         return _copy_root(job, checkpoints)
     if job.stage.kind == "search":
         return _search(job, latest)
+    if job.stage.kind == "average":
+        return _average(job)
     runner = _make_runner(job)
     if latest is not None:
         runner.load(latest, allow_drift=job.allow_drift)
@@ -90,6 +102,26 @@ def _search(job: Job, latest: Path | None) -> Path:
             runner.load(latest)
         return runner.run(job.check_claim)
     return job.folder / "checkpoints" / f"model_{job.stage.iterations}.pt"
+
+
+def _average(job: Job) -> Path:
+    """Average a distilled policy with the one its round started from; the rest of its learner stays.
+
+    Both are near each other, so that what lies between acts like something between (Wortsman et al. 2022, "Robust
+    fine-tuning of zero-shot models").
+    """
+    checkpoints = job.folder / "checkpoints"
+    if job.rank == 0:
+        assert job.init is not None, "an average has an end"
+        assert job.start is not None, "and a start"
+        end, start = (load_checkpoint(path).state for path in (job.init, job.start))
+        learner, weights = end["algorithm"], start["algorithm"]["actor_state_dict"]
+        share = job.cfg.plan.start_share
+        actor = {name: torch.lerp(x, weights[name], share) for name, x in learner["actor_state_dict"].items()}
+        counters = {"next_iteration": 0, "env_steps": 0, "wall_time": 0.0}
+        state = end | {"algorithm": learner | {"actor_state_dict": actor}, "runner": counters}
+        patiently(lambda: save_checkpoint(checkpoints, state, job.provenance, iteration=0, env_steps=0, stage_end=True))
+    return checkpoints / "model_0.pt"
 
 
 def _make_runner(job: Job) -> EagleRunner:

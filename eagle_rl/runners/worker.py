@@ -110,6 +110,7 @@ class Worker:
             folder=stage_dir(self.run_dir, stage.name),
             init=None if stage.init is None else inputs[stage.init],
             teachers=tuple(inputs[name] for name in stage.teachers),
+            start=None if stage.start is None else inputs[stage.start],
             base=None if stage.base is None else inputs[stage.base],
             make_env=self.make_env,
             provenance=provenance,

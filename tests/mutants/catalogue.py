@@ -197,6 +197,12 @@ MUTANTS: tuple[Mutant, ...] = (
         "self.parameters - step, self.parameters + step",
         "learner/test_search.py",
     ),
+    Mutant(
+        "eagle_rl/runners/training.py",
+        "torch.lerp(x, weights[name], share)",
+        "torch.lerp(weights[name], x, share)",
+        "runners/test_stages.py",
+    ),
     Mutant(SEARCHING, "cost[1] - cost[0]", "cost[0] - cost[1]", "runners/test_searching.py"),
     Mutant(SEARCH, "better.clamp(-bound, bound)", "better", "learner/test_search.py"),
     Mutant(SEARCH, "- weight @ self.mean", "", "learner/test_search.py"),

@@ -62,6 +62,19 @@ def test_a_search_alone_starts_from_the_generalist():
     assert stages["round2/search_g1"].inputs == ("round1/distill",)
 
 
+def test_an_average_ends_a_round_and_the_next_one_starts_from_it():
+    stages = {stage.name: stage for stage in plan(start_share=0.5)}
+    average = stages["round1/average"]
+    assert average.inputs == ("round1/distill", "generalist")
+    assert (average.env_steps, average.iterations, average.specialised) == (0, 0, False)
+    assert stages["round2/specialist_g1"].inputs == ("round1/average",)
+    assert stages["round2/average"].inputs == ("round2/distill", "round1/average")
+    records = {name: Record() for name in stages}
+    scores = {"generalist": 0.5, "round1/distill": 0.3, "round1/average": 0.499}
+    records |= {name: Record(score=score) for name, score in scores.items()}
+    assert converged_round(list(stages.values()), records, 0.01) == 1, "a round is worth what it ends with"
+
+
 def test_inputs_come_before_the_stages_that_need_them():
     seen: set[str] = set()
     for stage in plan():

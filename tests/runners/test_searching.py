@@ -98,6 +98,7 @@ def test_only_the_first_of_several_processes_searches(tmp_path):
         folder=tmp_path,
         init=None,
         teachers=(),
+        start=None,
         base=None,
         make_env=refuse,
         provenance=Provenance(),

@@ -11,11 +11,11 @@ import torch
 
 from eagle_rl.errors import CheckpointError, ConfigError, EagleWarning
 from eagle_rl.evaluation.evaluate import EvaluationResult
-from eagle_rl.runners.checkpoint import load_checkpoint
+from eagle_rl.runners.checkpoint import load_actor, load_checkpoint
 from eagle_rl.runners.claims import Claim, ClaimLostError
 from eagle_rl.runners.plan import plan_stages
 from eagle_rl.runners.provenance import Provenance
-from eagle_rl.runners.records import read_record, stage_dir
+from eagle_rl.runners.records import final_checkpoint, read_record, stage_dir
 from eagle_rl.runners.stages import run_experiment
 from eagle_rl.runners.training import Job, train
 from tests.runners.toy_run import ENVS, STEPS, JudgedToyEnv, make_toy_env, parameters, toy_experiment
@@ -220,6 +220,7 @@ def test_who_reads_the_root_while_another_process_copies_it_reads_all_of_it(fini
         folder=tmp_path,
         init=None,
         teachers=(),
+        start=None,
         base=None,
         make_env=make_toy_env,
         provenance=Provenance(),
@@ -242,3 +243,20 @@ def test_the_run_is_complete_without_its_root(finished, tmp_path):
     assert Path(result.run_dir) in copied.parents
     assert load_checkpoint(copied).manifest["sha256"] == result.records["root"].sha256
     assert read_record(result.run_dir, "continued").inputs == {"root": result.records["root"].sha256}
+
+
+def test_a_round_may_end_between_where_it_started_and_what_was_distilled(tmp_path):
+    cfg = toy_experiment(iterations=1, start_share=0.25)
+    result = run_experiment(cfg, tmp_path / "run", make_toy_env)
+    start, distilled, average = (
+        load_actor(final_checkpoint(result.run_dir, name))[0].state_dict()
+        for name in ("generalist", "round1/distill", "round1/average")
+    )
+    assert result.generalist == final_checkpoint(result.run_dir, "round1/average")
+    assert result.records["round1/average"].env_steps == 0
+    assert result.records["round1/average"].score is not None, "it is judged like the others"
+    for name, x in average.items():
+        torch.testing.assert_close(x, 0.25 * start[name] + 0.75 * distilled[name], msg=name)
+    assert any(not torch.equal(start[name], distilled[name]) for name in start)
+    again = run_experiment(cfg, result.run_dir, make_toy_env, resume=True)
+    assert again.records == result.records
