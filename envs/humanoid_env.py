@@ -48,7 +48,7 @@ from .robots.spec import RobotSpec
 from .sim.batch import RobotBatch
 from .sim.health import MAX_ACTION
 from .sim.pool import PhysicsPool
-from .sim.terrain import build_terrain
+from .sim.terrain import Terrain, build_terrain
 from .state import PooledState
 from .step_log import StepLog, episode_ratio
 
@@ -106,41 +106,49 @@ class HumanoidEnv(VecEnv):
             for spec, count in zip(robots, counts, strict=True)
         ]
         self.pool = PhysicsPool(batches, self.device, dtype, overlap=num_threads != 1)
-        nominal = pool_robots(robots, counts, task, self.device, dtype)
         self.rng = CounterRng(
             seed,
             [name for name, count in zip(self.robot_names, counts, strict=True) for _ in range(count)],
             torch.cat([first_env + torch.arange(count) for count in counts]).to(self.device),
         )
+        nominal = pool_robots(robots, counts, task, self.device, dtype)
         self.randomizer = Randomizer(task.randomization, self.pool, nominal, self.rng)
         self.robots = self.randomizer.robots
-        sampler = CommandSampler(task.commands, self.robots, len(robots), self.rng, self.step_dt)
-        self.commands = ActiveCommands(sampler, round(task.commands.resampling_time_s / self.step_dt), dtype)
-        self.aids = LearningAids(task.aids, len(robots), self.device)
-        observations = task.observations
-        points = scan_points(observations).to(self.device, dtype)
-        robot_id = self.robots.robot_id
-        self.posture = make_posture(task.control, robots, self.robots, self.step_dt)
-        self.ground = make_ground(terrain, points, robot_id, self.rng, self.step_dt, self.max_episode_length)
-        self.embodiment = (
-            pooled_embodiment(robots, robot_id, self.randomizer.bodies, observations.descriptor)
-            if observations.embodiment_observation
-            else None
-        )
-        self.layout = ObservationLayout(observations)
-        self.mirror = self.layout.mirror(self.device)
-        self._live = self.robots.slot_mask > 0
-        self._noise = noise_scale(observations, self.robots)
-        self.step_log = StepLog(self.robot_names, robot_id)
-        self._all = torch.arange(num_envs, device=self.device)
+        self._make_task(robots, terrain, dtype)
+        self._make_observations(robots)
         self._allocate(dtype)
         self._apply_aids()
         self.reset()
         self._no_observations = self.get_observations()[:0].clone()
 
+    def _make_task(self, robots: Sequence[RobotSpec], terrain: Terrain | None, dtype: torch.dtype) -> None:
+        """What the robots are asked for: commands, aids, the resting posture and the ground."""
+        task, dt = self.task, self.step_dt
+        sampler = CommandSampler(task.commands, self.robots, len(robots), self.rng, dt)
+        self.commands = ActiveCommands(sampler, round(task.commands.resampling_time_s / dt), dtype)
+        self.aids = LearningAids(task.aids, len(robots), self.device)
+        self.posture = make_posture(task.control, robots, self.robots, dt)
+        points = scan_points(task.observations).to(self.device, dtype)
+        self.ground = make_ground(terrain, points, self.robots.robot_id, self.rng, dt, self.max_episode_length)
+        self.step_log = StepLog(self.robot_names, self.robots.robot_id)
+
+    def _make_observations(self, robots: Sequence[RobotSpec]) -> None:
+        """What the robots are told, and how it looks in a mirror."""
+        observations = self.task.observations
+        self.embodiment = (
+            pooled_embodiment(robots, self.robots.robot_id, self.randomizer.bodies, observations.descriptor)
+            if observations.embodiment_observation
+            else None
+        )
+        self.layout = ObservationLayout(observations)
+        self.mirror = self.layout.mirror(self.device)
+        self._noise = noise_scale(observations, self.robots)
+
     def _allocate(self, dtype: torch.dtype) -> None:
         """Buffers that outlive a step."""
         n, device = self.num_envs, self.device
+        self._live = self.robots.slot_mask > 0
+        self._all = torch.arange(n, device=device)
         self.common_step_counter = 0
         self.episode_length_buf = torch.zeros(n, dtype=torch.long, device=device)
         self.episode_count = torch.zeros(n, dtype=torch.long, device=device)

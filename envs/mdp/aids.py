@@ -1,6 +1,7 @@
 """Learning aids, annealed to exactly zero: a virtual harness on the base, and a softer gait reward (ours).
 
-Both have one scale per robot that decays while the robot no longer needs it. Evaluation runs without either.
+Both have one scale per robot that decays while the robot no longer needs it; the harness returns where it falls.
+Evaluation runs without either.
 """
 
 from __future__ import annotations
@@ -15,8 +16,10 @@ from eagle_rl.config.schema import AidsCfg
 from ..geometry import from_yaw_frame
 from ..state import PooledRobots, PooledState
 
-_SMOOTHING = 0.05
-"""Share of the newest interval in the running means that decide about decay [-]; few environments make it noisy."""
+_EPISODE_SMOOTHING = 0.2
+"""Share of the newest interval in the running mean of episode lengths [-]; were it less, too much harness would go."""
+_MATCH_SMOOTHING = 0.05
+"""The same of contacts, which follow slowly [-]; few environments make both noisy."""
 _SNAP = 0.01
 """Scale under which an aid is off [-]."""
 _GRAVITY = 9.81
@@ -57,19 +60,23 @@ class LearningAids:
         self._contact_match = torch.zeros_like(self.harness)
 
     def update(self, episode_ratio: Tensor, contact_match: Tensor) -> None:
-        """Decay what is no longer needed; call once per ``interval_steps``.
+        """Decay what is no longer needed, and give a robot that falls some of its harness back.
+
+        Call once per ``interval_steps``. A harness that is gone stays gone.
 
         Args:
             episode_ratio: mean episode length of each robot over the full length, shape (R,).
             contact_match: share of steps in which its feet agree with the clock, shape (R,).
         """
         cfg = self.cfg
-        self._episode_ratio = torch.lerp(self._episode_ratio, episode_ratio.to(self._episode_ratio), _SMOOTHING)
-        self._contact_match = torch.lerp(self._contact_match, contact_match.to(self._contact_match), _SMOOTHING)
+        self._episode_ratio = torch.lerp(self._episode_ratio, episode_ratio.to(self._episode_ratio), _EPISODE_SMOOTHING)
+        self._contact_match = torch.lerp(self._contact_match, contact_match.to(self._contact_match), _MATCH_SMOOTHING)
+        falls = self._episode_ratio < cfg.harness_return_ratio
         stands = self._episode_ratio >= cfg.min_episode_ratio
         steps = self._contact_match >= cfg.harness_contact_match
         walks = self._contact_match >= cfg.min_contact_match
-        self.harness = _decayed(self.harness, stands & steps, cfg.harness_decay)
+        returned = (self.harness / (1.0 - cfg.harness_decay)).clamp(max=cfg.harness)
+        self.harness = torch.where(falls, returned, _decayed(self.harness, stands & steps, cfg.harness_decay))
         self.gait_shaping = _decayed(self.gait_shaping, walks & (self.harness == 0.0), cfg.gait_shaping_decay)
 
     def state_dict(self) -> dict[str, Tensor]:

@@ -55,6 +55,23 @@ def test_harness_decays_only_while_episodes_are_long_and_feet_follow_the_clock()
     assert aids.log(["a", "b", "c"])["Curriculum/harness/a"] == aids.harness[0].item()
 
 
+def test_harness_returns_to_a_robot_that_falls_but_never_beyond_its_start() -> None:
+    cfg = AidsCfg()
+    between = 0.5 * (cfg.min_episode_ratio + cfg.harness_return_ratio)
+    aids = settled([0.9, 0.9], [0.9, 0.9])
+    decayed = aids.harness.clone()
+    for _ in range(20):
+        aids.update(torch.tensor([0.0, between]), GOOD)
+    assert decayed[0] < aids.harness[0] < cfg.harness, "the first falls"
+    assert aids.harness[1] < decayed[1], "a robot between both thresholds keeps what is left"
+    held = aids.harness[1].clone()
+    aids.update(torch.tensor([0.0, between]), GOOD)
+    assert aids.harness[1] == held
+    for _ in range(500):
+        aids.update(BAD, GOOD)
+    assert aids.harness.tolist() == [cfg.harness, cfg.harness]
+
+
 def test_gait_shaping_stays_until_its_robots_harness_is_exactly_zero() -> None:
     aids = LearningAids(AidsCfg(), 2)
     while aids.harness[0] > 0.0:
@@ -93,7 +110,7 @@ def test_aids_end_at_exactly_zero_and_stay_there() -> None:
 
 
 def test_aids_survive_saving() -> None:
-    first, second = LearningAids(AidsCfg(), 2), LearningAids(AidsCfg(harness=0.0), 2)
+    first, second = LearningAids(AidsCfg(), 2), LearningAids(AidsCfg(), 2)
     for _ in range(50):
         first.update(torch.tensor([1.0, 0.0]), GOOD)
     second.load_state_dict(first.state_dict())

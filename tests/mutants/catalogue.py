@@ -135,6 +135,7 @@ MUTANTS: tuple[Mutant, ...] = (
         "mdp/test_commands.py",
     ),
     Mutant(AIDS, "_HEIGHT_STIFFNESS * sag", "_HEIGHT_STIFFNESS * -sag", "mdp/test_aids.py"),
+    Mutant(AIDS, "torch.where(falls, returned,", "torch.where(falls, self.harness,", "mdp/test_aids.py"),
     Mutant(
         "envs/mdp/terminations.py",
         "state.base_roll.abs() > cfg.max_roll",
