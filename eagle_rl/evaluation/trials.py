@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
@@ -48,6 +48,19 @@ class PairedTrials:
     def observations(self) -> TensorDict:
         """What the first lot sees at the moment."""
         return self._lots[0].get_observations()
+
+    @property
+    def mirror(self) -> Mapping[str, tuple[Tensor, Tensor]]:
+        """Permutation and signs of every observation group and of ``actions``."""
+        mirror: Mapping[str, tuple[Tensor, Tensor]] = self._lots[0].mirror
+        return mirror
+
+    def mirrored(self, obs: TensorDict) -> TensorDict:
+        """What the mirror images of the robots would see, in the groups that have sides."""
+        sided = {name: pair for name, pair in self.mirror.items() if name in obs.keys()}  # noqa: SIM118
+        return obs.clone(recurse=False).update(
+            {name: obs[name].index_select(1, perm) * sign for name, (perm, sign) in sided.items()}
+        )
 
     def commands(self, number: int) -> Tensor:
         """Commands of the trials of this number, some of them to stand, shape (P, draws, 5)."""

@@ -82,16 +82,26 @@ class SearchRunner:
     def _begin(self) -> LastLayerSearch:
         """A search along the principal directions of the last hidden layer, as the policy moves it."""
         hidden: list[Tensor] = []
+        mirrored: list[Tensor] = []
 
         def act(obs: TensorDict) -> Tensor:
             hidden.append(self._actor.hidden(obs))
+            mirrored.append(self._actor.hidden(self._trials.mirrored(obs)))
             return self._actor(obs)
 
         self._trials.follow(0, self._trials.commands(self.stage.iterations), act)
         self._trials.align()
         self.env_steps += self._trials.steps
         live = self._trials.observations()["slot_mask"][0].nonzero().flatten()
-        return LastLayerSearch.along(self.cfg.search, torch.cat(hidden), live, self.stage.iterations, self.stage.seed)
+        return LastLayerSearch.along(
+            self.cfg.search,
+            torch.cat(hidden),
+            torch.cat(mirrored),
+            slots=live,
+            mirror=self._trials.mirror["actions"],
+            num_generations=self.stage.iterations,
+            seed=self.stage.seed,
+        )
 
     @torch.no_grad()
     def _generation(self, search: LastLayerSearch) -> dict[str, float]:
