@@ -174,8 +174,9 @@ class SearchCfg:
     """Length of the first step as a share of that of a perturbation [-]; the last one is a fifth of it."""
     error_units: tuple[float, float, float, float, float] = (0.05, 0.08, 0.05, 0.02, 0.04)
     """Errors of v_x, v_y, omega, height and pitch that weigh the same [m/s, m/s, rad/s, m, rad]."""
-    randomization: bool = False
-    """Bodies, motors, noise and pushes as in training, the same for both policies of a pair."""
+    randomized_share: float = 0.5
+    """Share of pairs in the world of training, with its bodies, motors, noise and pushes [-]; the best where nothing
+    disturbs falls more where something does."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""Pairs of trials that differ in nothing but the policy: same start, same commands, same random numbers."""
+"""Pairs of trials that differ in nothing but the policy: same world, same start, commands and random numbers."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from eagle_rl.config.schema import EvaluationCfg, ExperimentCfg
+from eagle_rl.config.schema import EvaluationCfg, ExperimentCfg, TaskCfg
 from eagle_rl.evaluation.evaluate import MakeEnv
 from eagle_rl.evaluation.protocol import COMMANDS, NUM_VELOCITIES, draw_commands, evaluation_task, steps_per_draw
 
@@ -19,23 +19,22 @@ Act = Callable[[TensorDict], Tensor]
 
 
 class PairedTrials:
-    """Two lots of P environments of one robot, equal to the last bit."""
+    """Two lots of P environments of one robot, equal to the last bit, some of them randomized as in training."""
 
     def __init__(self, cfg: ExperimentCfg, make_env: MakeEnv, seed: int) -> None:
         """Build both lots from ``cfg.search`` and the one robot of ``cfg``, in the physics of training."""
-        search, sim = cfg.search, cfg.task.sim
+        search = cfg.search
         self._cfg, self._robot, self._seed = search, cfg.robots[0], seed
-        self._ev = EvaluationCfg(
-            num_steps=search.num_steps,
-            resampling_time_s=search.resampling_time_s,
-            physics_dt=sim.physics_dt,
-            decimation=sim.decimation,
-            randomization=search.randomization,
-            noise=search.randomization,
-        )
-        task = evaluation_task(cfg.task, self._ev)
+        disturbed = round(search.randomized_share * search.num_pairs)
+        worlds = [(search.num_pairs - disturbed, False), (disturbed, True)]
+        worlds = [(size, randomized) for size, randomized in worlds if size]
+        self._sizes = [size for size, _ in worlds]
+        self._ev, task = _world(cfg, randomized=False)
         self._ranges, self._device = task.commands, cfg.run.env_device
-        self._lots: tuple[Any, ...] = tuple(make_env(cfg.robots, search.num_pairs, task, seed) for _ in range(2))
+        self._lots: tuple[list[Any], ...] = tuple(
+            [make_env(cfg.robots, size, _world(cfg, randomized)[1], seed) for size, randomized in worlds]
+            for _ in range(2)
+        )
         worst = [max(map(abs, getattr(task.commands, name).finishing)) for name in COMMANDS]
         self._fallen_errors = torch.tensor(worst, device=self._device)
         self._units = torch.tensor(search.error_units, device=self._device)
@@ -45,14 +44,14 @@ class PairedTrials:
         """Environment steps of one lot's trial."""
         return self._cfg.num_pairs * self._cfg.num_steps
 
-    def observations(self) -> TensorDict:
-        """What the first lot sees at the moment."""
-        return self._lots[0].get_observations()
+    def observations(self, lot: int = 0) -> TensorDict:
+        """What a lot sees at the moment."""
+        return _joined([env.get_observations() for env in self._lots[lot]])
 
     @property
     def mirror(self) -> Mapping[str, tuple[Tensor, Tensor]]:
         """Permutation and signs of every observation group and of ``actions``."""
-        mirror: Mapping[str, tuple[Tensor, Tensor]] = self._lots[0].mirror
+        mirror: Mapping[str, tuple[Tensor, Tensor]] = self._lots[0][0].mirror
         return mirror
 
     def mirrored(self, obs: TensorDict) -> TensorDict:
@@ -84,31 +83,61 @@ class PairedTrials:
             Mean error over steps and commands in multiples of ``error_units``, (P,), in which every step after a fall
             counts as the largest command there is; and who fell, bool (P,).
         """
-        env = self._lots[lot]
-        env.pin_commands(commands[:, 0])
-        env.reset()
+        envs, redraw = self._lots[lot], steps_per_draw(self._ev)
+        self._pin(lot, commands[:, 0])
+        for env in envs:
+            env.reset()
         fell = torch.zeros(len(commands), dtype=torch.bool, device=self._device)
         cost = torch.zeros(len(commands), device=self._device)
         for t in range(self._cfg.num_steps):
-            if t % steps_per_draw(self._ev) == 0:
-                env.pin_commands(commands[:, t // steps_per_draw(self._ev)])
-                obs = env.get_observations()
-            obs, _, dones, extras = env.step(act(obs))
-            fell |= dones.bool() & ~extras["time_outs"].bool()
-            errors = torch.where(fell.unsqueeze(1), self._fallen_errors, env.tracking_errors().float())
+            if t % redraw == 0:
+                self._pin(lot, commands[:, t // redraw])
+                obs = self.observations(lot)
+            steps = [env.step(actions) for env, actions in zip(envs, act(obs).split(self._sizes), strict=True)]
+            obs = _joined([step[0] for step in steps])
+            fell |= torch.cat([dones.bool() & ~extras["time_outs"].bool() for _, _, dones, extras in steps])
+            followed = torch.cat([env.tracking_errors().float() for env in envs])
+            errors = torch.where(fell.unsqueeze(1), self._fallen_errors, followed)
             if t >= self._cfg.settling_steps:
                 cost += (errors / self._units).mean(dim=1)
         return cost / (self._cfg.num_steps - self._cfg.settling_steps), fell
 
+    def _pin(self, lot: int, commands: Tensor) -> None:
+        """Give each environment of a lot its command, (P, 5)."""
+        for env, part in zip(self._lots[lot], commands.split(self._sizes), strict=True):
+            env.pin_commands(part)
+
     def align(self) -> None:
         """Give the second lot the state of the first, after a trial of the first alone."""
-        self._lots[1].load_state_dict(self._lots[0].state_dict())
+        first = self.state_dict()[0]
+        self.load_state_dict([first, first])
 
-    def state_dict(self) -> list[dict[str, Any]]:
+    def state_dict(self) -> list[list[dict[str, Any]]]:
         """State of both lots."""
-        return [lot.state_dict() for lot in self._lots]
+        return [[env.state_dict() for env in lot] for lot in self._lots]
 
-    def load_state_dict(self, state: list[dict[str, Any]]) -> None:
+    def load_state_dict(self, state: list[list[dict[str, Any]]]) -> None:
         """Restore what :meth:`state_dict` returned."""
         for lot, saved in zip(self._lots, state, strict=True):
-            lot.load_state_dict(saved)
+            for env, part in zip(lot, saved, strict=True):
+                env.load_state_dict(part)
+
+
+def _joined(parts: list[TensorDict]) -> TensorDict:
+    joined: object = torch.cat(parts)  # type: ignore[arg-type]
+    assert isinstance(joined, TensorDict)
+    return joined
+
+
+def _world(cfg: ExperimentCfg, randomized: bool) -> tuple[EvaluationCfg, TaskCfg]:
+    """How commands are drawn, and the task of the trials in the nominal or the randomized world."""
+    search, sim = cfg.search, cfg.task.sim
+    ev = EvaluationCfg(
+        num_steps=search.num_steps,
+        resampling_time_s=search.resampling_time_s,
+        physics_dt=sim.physics_dt,
+        decimation=sim.decimation,
+        randomization=randomized,
+        noise=randomized,
+    )
+    return ev, evaluation_task(cfg.task, ev)

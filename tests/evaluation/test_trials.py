@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict
 
 from eagle_rl.cli.environment import make_env_factory
-from eagle_rl.config.schema import ExperimentCfg, RunCfg, SearchCfg
+from eagle_rl.config.schema import ExperimentCfg, RunCfg, SearchCfg, TaskCfg
 from eagle_rl.evaluation.trials import PairedTrials
 from tests.evaluation.fake import ScriptedEnv, idle, make_scripted_env, perfect
 
@@ -57,9 +57,9 @@ def test_each_number_has_commands_of_its_own_and_a_share_of_them_stands():
     assert (many[..., 3:] != 0).all(), "who stands squats and leans all the same"
 
 
-@pytest.mark.parametrize("randomization", [False, True])
-def test_both_lots_of_a_real_robot_end_a_trial_alike_however_often(randomization):
-    search = dataclasses.replace(SEARCH, num_pairs=3, num_steps=30, resampling_time_s=0.3, randomization=randomization)
+@pytest.mark.parametrize("share", [0.0, 0.34, 1.0])
+def test_both_lots_of_a_real_robot_end_a_trial_alike_however_often(share):
+    search = dataclasses.replace(SEARCH, num_pairs=3, num_steps=30, resampling_time_s=0.3, randomized_share=share)
     cfg = dataclasses.replace(CFG, search=search)
     trials = PairedTrials(cfg, make_env_factory(RunCfg(num_threads=1)), 1)
 
@@ -73,3 +73,20 @@ def test_both_lots_of_a_real_robot_end_a_trial_alike_however_often(randomization
         assert torch.equal(*costs), f"trial {number}: nothing but the policy may differ"
     other = trials.follow(0, trials.commands(2), partial(shake, size=0.3))[0]
     assert not torch.equal(trials.follow(1, trials.commands(2), partial(shake, size=0.2))[0], other)
+
+
+def test_a_share_of_the_pairs_is_in_the_world_of_training():
+    worlds = []
+
+    def make_env(robots: object, num_envs: int, task: TaskCfg, seed: int, first: int = 0) -> ScriptedEnv:
+        worlds.append((num_envs, task.randomization.enabled, task.observations.enable_corruption))
+        return ScriptedEnv(num_envs, task)
+
+    search = dataclasses.replace(SEARCH, randomized_share=0.25)
+    trials = PairedTrials(dataclasses.replace(CFG, search=search), make_env, 1)
+    assert worlds == 2 * [(24, False, False), (8, True, True)]
+    commands = trials.commands(0)
+    assert len(trials.observations()) == 32
+    cost, fell = trials.follow(0, commands, perfect)
+    assert cost.shape == fell.shape == (32,)
+    torch.testing.assert_close(cost, torch.zeros(32), atol=1e-6, rtol=0, msg="each follows the command it is given")
