@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T", bound="DataclassInstance")
 
-RETIRED = {"task.control.gait_reference": 0.0}
+RETIRED = {"task.control.gait_reference": 0.0, "search.randomization": False}
 """Keys of earlier versions and the value that meant off: stored configurations that say just that still load."""
 
 _WORDS: dict[Any, str] = {bool: "true or false", int: "an integer", float: "a number", str: "text"}
