@@ -98,8 +98,7 @@ class HumanoidEnv(VecEnv):
         self.step_dt = task.sim.physics_dt * task.sim.decimation
         self.max_episode_length = round(task.terminations.episode_length_s / self.step_dt)
         self.robot_names = [spec.name for spec in robots]
-        counts = share(num_envs, len(robots))
-        terrain = build_terrain(task.terrain, seed)
+        counts, terrain = share(num_envs, len(robots)), build_terrain(task.terrain, seed)
         field = terrain.field if terrain is not None else None
         batches = [
             RobotBatch(spec, build_model(spec, task.sim, field), count, task.sim.decimation, num_threads)
@@ -115,26 +114,21 @@ class HumanoidEnv(VecEnv):
         self.randomizer = Randomizer(task.randomization, self.pool, nominal, self.rng)
         self.robots = self.randomizer.robots
         self._make_task(robots, terrain, dtype)
-        self._make_observations(robots)
         self._allocate(dtype)
         self._apply_aids()
         self.reset()
         self._no_observations = self.get_observations()[:0].clone()
 
     def _make_task(self, robots: Sequence[RobotSpec], terrain: Terrain | None, dtype: torch.dtype) -> None:
-        """What the robots are asked for: commands, aids, the resting posture and the ground."""
-        task, dt = self.task, self.step_dt
+        """What the robots are asked for, stand on and are told, and how it looks in a mirror."""
+        task, dt, observations = self.task, self.step_dt, self.task.observations
         sampler = CommandSampler(task.commands, self.robots, len(robots), self.rng, dt)
         self.commands = ActiveCommands(sampler, round(task.commands.resampling_time_s / dt), dtype)
         self.aids = LearningAids(task.aids, len(robots), self.device)
         self.posture = make_posture(task.control, robots, self.robots, dt)
-        points = scan_points(task.observations).to(self.device, dtype)
+        points = scan_points(observations).to(self.device, dtype)
         self.ground = make_ground(terrain, points, self.robots.robot_id, self.rng, dt, self.max_episode_length)
         self.step_log = StepLog(self.robot_names, self.robots.robot_id)
-
-    def _make_observations(self, robots: Sequence[RobotSpec]) -> None:
-        """What the robots are told, and how it looks in a mirror."""
-        observations = self.task.observations
         self.embodiment = (
             pooled_embodiment(robots, self.robots.robot_id, self.randomizer.bodies, observations.descriptor)
             if observations.embodiment_observation
@@ -154,8 +148,7 @@ class HumanoidEnv(VecEnv):
         self.episode_count = torch.zeros(n, dtype=torch.long, device=device)
         self.phase = torch.zeros(n, dtype=dtype, device=device)
         zeros = torch.zeros(n, NUM_SLOTS, dtype=dtype, device=device)
-        self._actions, self._last_actions, self._last_last_actions = zeros, zeros, zeros
-        self._last_joint_vel = zeros
+        self._actions = self._last_actions = self._last_last_actions = self._last_joint_vel = zeros
         self._last_contact = torch.zeros(n, 2, dtype=torch.bool, device=device)
         self._staged = self.pool.staged()
         self.state = self._derive()

@@ -33,6 +33,7 @@ METHODS = {
     "fork_compass": "COMPASS",
     "fork_kickstarting": "Kickstarting",
     "fork_eagle": "EAGLE",
+    "fork_search": "EAGLE, searched",
     "fork_eagle_id": "EAGLE w/ ID",
 }
 """The paper's name for each of its experiments."""
