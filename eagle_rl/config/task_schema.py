@@ -341,7 +341,7 @@ class AidsCfg:
     min_episode_ratio: float = 0.6
     """The harness decays while the mean episode lasts this share of its full length."""
     harness_return_ratio: float = 0.4
-    """It grows again, as fast, while the mean episode is shorter than this share; 0 is never."""
+    """It grows again, at that rate, while the mean episode is shorter than this share; 0 is never."""
     harness_contact_match: float = 0.7
     """... and while foot contacts match the clock this often; dropped earlier, robots stand and never step."""
     min_contact_match: float = 0.8

@@ -75,7 +75,7 @@ class LearningAids:
         stands = self._episode_ratio >= cfg.min_episode_ratio
         steps = self._contact_match >= cfg.harness_contact_match
         walks = self._contact_match >= cfg.min_contact_match
-        returned = (self.harness / (1.0 - cfg.harness_decay)).clamp(max=cfg.harness)
+        returned = (self.harness * (1.0 + cfg.harness_decay)).clamp(max=cfg.harness)
         self.harness = torch.where(falls, returned, _decayed(self.harness, stands & steps, cfg.harness_decay))
         self.gait_shaping = _decayed(self.gait_shaping, walks & (self.harness == 0.0), cfg.gait_shaping_decay)
 

@@ -207,6 +207,9 @@ MUTANTS: tuple[Mutant, ...] = (
     Mutant(SEARCHING, "cost[1] - cost[0]", "cost[0] - cost[1]", "runners/test_searching.py"),
     Mutant(SEARCH, "better.clamp(-bound, bound)", "better", "learner/test_search.py"),
     Mutant(SEARCH, "- weight @ self.mean", "", "learner/test_search.py"),
+    Mutant(SEARCH, "noise + self.sign * noise", "noise + noise", "learner/test_search.py"),
+    Mutant(SEARCH, "parity.abs() > MIN_PARITY", "parity.abs() >= 0.0", "learner/test_search.py"),
+    Mutant(TRIALS, "(disturbed, True)", "(disturbed, False)", "evaluation/test_trials.py"),
     Mutant(
         TRIALS,
         "torch.where(fell.unsqueeze(1), self._fallen_errors, ",
