@@ -90,3 +90,16 @@ def test_a_share_of_the_pairs_is_in_the_world_of_training():
     cost, fell = trials.follow(0, commands, perfect)
     assert cost.shape == fell.shape == (32,)
     torch.testing.assert_close(cost, torch.zeros(32), atol=1e-6, rtol=0, msg="each follows the command it is given")
+
+
+def test_a_mirror_image_swaps_sides_and_is_its_own_inverse():
+    search = dataclasses.replace(SEARCH, num_pairs=4, randomized_share=0.5)
+    trials = PairedTrials(dataclasses.replace(CFG, search=search), make_env_factory(RunCfg(num_threads=1)), 1)
+    trials.follow(0, trials.commands(0), lambda obs: 0.3 * torch.sin(torch.arange(32.0)) * obs["slot_mask"])
+    obs = trials.observations()
+    image = trials.mirrored(obs)
+    sides = torch.tensor([1.0, -1.0, -1.0, 1.0, 1.0])
+    torch.testing.assert_close(image["command"], obs["command"] * sides, msg="v_y and omega change sign")
+    assert not torch.equal(image["history"], obs["history"])
+    twice = trials.mirrored(image)
+    assert all(torch.equal(twice[name], obs[name]) for name in ("history", "command", "clock", "slot_mask"))
