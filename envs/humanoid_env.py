@@ -212,6 +212,7 @@ class HumanoidEnv(VecEnv):
             "critic": critic_observation(self._last_frame, state, self.robots, self.embodiment, cfg, friction),
             "estimate": estimation_target(state, self.embodiment, cfg),
             "slot_mask": self.robots.slot_mask,
+            "phase": self.phase,
         }
         tensors = {name: value.float() for name, value in groups.items()}
         return TensorDict(tensors | {"robot": self.robots.robot_id}, batch_size=[self.num_envs])

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from eagle_rl.models import EagleActor
 from eagle_rl.models.actor import ACTOR_INPUTS
+from eagle_rl.models.correction import Correction
 
 CHUNK_ROWS = 16384
 """Rows labelled at once, to bound memory."""
@@ -18,9 +19,12 @@ CHUNK_ROWS = 16384
 class SpecialistBank:
     """One frozen specialist per robot; row i is judged by the specialist of ``obs["robot"][i]``."""
 
-    def __init__(self, specialists: Sequence[EagleActor]) -> None:
-        """Freeze ``specialists``, which are in the order of the environment's robots."""
+    def __init__(
+        self, specialists: Sequence[EagleActor], corrections: Sequence[Correction | None] | None = None
+    ) -> None:
+        """Freeze ``specialists``, which are in the order of the environment's robots, each with its correction."""
         self.specialists = [actor.eval().requires_grad_(False) for actor in specialists]
+        self.corrections = corrections or [None] * len(self.specialists)
 
     @torch.no_grad()
     def label(self, observations: TensorDict) -> dict[str, Tensor]:
@@ -41,10 +45,12 @@ class SpecialistBank:
         embedding_dim = self.specialists[0].architecture["networks"]["embedding_dim"]
         action, std = torch.empty_like(mask), torch.empty_like(mask)
         embedding = mask.new_empty(len(mask), embedding_dim)
-        for robot, specialist in enumerate(self.specialists):
+        for robot, (specialist, correction) in enumerate(zip(self.specialists, self.corrections, strict=True)):
             rows = (obs["robot"] == robot).nonzero(as_tuple=True)[0]
             inputs = (obs[group][rows] for group in ACTOR_INPUTS)
             latent, embedding[rows], _ = specialist.features(*inputs)
             action[rows] = specialist.mlp(latent) * mask[rows]
+            if correction is not None:
+                action[rows] = correction.act(specialist, obs[rows])
             std[rows] = specialist.distribution.std_param.clamp(*specialist.distribution.std_range) * mask[rows]
         return {"teacher_action": action, "teacher_std": std, "teacher_embedding": embedding}

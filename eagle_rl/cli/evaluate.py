@@ -113,7 +113,7 @@ def _judge(name: str, policy: Policy, ev: EvaluationCfg, robots: Sequence[str], 
     make_env = make_env_factory(cfg.run)
     with Progress(console=console, transient=True) as progress:
         bar = progress.add_task(name, total=len(robots) * ev.num_envs_per_robot * ev.num_steps)
-        scores = evaluate(policy.actor, make_env, robots, cfg.task, ev, on_step=lambda n: progress.advance(bar, n))
+        scores = evaluate(policy.act, make_env, robots, cfg.task, ev, on_step=lambda n: progress.advance(bar, n))
     return EvaluationResult(
         checkpoint=policy.sha256,
         protocol=ev,

@@ -91,7 +91,7 @@ def _load(args: argparse.Namespace, checkpoint: Path, seconds: float) -> Session
 
     policy = load_policy(checkpoint)
     names = chosen_robots(args.robots, policy.cfg)
-    return Session(policy.actor, policy.cfg, names, num_steps=round(seconds / CONTROL_STEP))
+    return Session(policy.act, policy.cfg, names, num_steps=round(seconds / CONTROL_STEP))
 
 
 def main(argv: Sequence[str]) -> int:

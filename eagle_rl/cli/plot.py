@@ -141,7 +141,7 @@ def _response(args: argparse.Namespace) -> dict[str, Figure]:
     figures = {}
     for name, policy, robots in _policies(args):
         cfg = policy.cfg
-        traces = command_responses(policy.actor, make_env_factory(cfg.run), robots, cfg.task, cfg.evaluation)
+        traces = command_responses(policy.act, make_env_factory(cfg.run), robots, cfg.task, cfg.evaluation)
         figures[name] = plots.responses(traces)
     return figures
 
@@ -167,9 +167,7 @@ def _swept(args: argparse.Namespace, sweeps: Mapping[str, Sweep]) -> dict[str, F
     for name, policy, robots in _policies(args):
         cfg, make_env = policy.cfg, make_env_factory(policy.cfg.run)
         ev = _protocol(args, cfg)
-        scores = {
-            kind: sweep(policy.actor, make_env, robots, cfg.task, ev, through) for kind, through in sweeps.items()
-        }
+        scores = {kind: sweep(policy.act, make_env, robots, cfg.task, ev, through) for kind, through in sweeps.items()}
         figures[name] = plots.robustness((sweeps[kind], scores[kind]) for kind in sweeps)
         plain = {
             kind: {str(value): {robot: _brief(m) for robot, m in scored.items()} for value, scored in by_value.items()}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,6 +15,9 @@ from eagle_rl.errors import ConfigError
 from .arguments import require_device
 
 if TYPE_CHECKING:
+    from tensordict import TensorDict
+    from torch import Tensor
+
     from eagle_rl.models import EagleActor
 
 
@@ -23,6 +27,8 @@ class Policy:
 
     checkpoint: Path
     actor: EagleActor
+    act: Callable[[TensorDict], Tensor]
+    """Its mean actions: the actor's or, of a corrected specialist, those with their correction."""
     cfg: ExperimentCfg
     """The experiment it was trained in, to be run on the device asked for."""
     sha256: str
@@ -39,8 +45,9 @@ def load_policy(path: Path, device: str = "cpu") -> Policy:
         device: where it computes, whatever it was trained on.
     """
     from eagle_rl.config.load import experiment_from_plain
+    from eagle_rl.models.correction import CorrectedPolicy
     from eagle_rl.models.precision import set_up_torch
-    from eagle_rl.runners.checkpoint import load_actor
+    from eagle_rl.runners.checkpoint import load_actor, load_correction
     from eagle_rl.runners.judged import training_steps
     from eagle_rl.runners.locate import find_checkpoint
     from eagle_rl.runners.provenance import slot_table_hash
@@ -53,8 +60,10 @@ def load_policy(path: Path, device: str = "cpu") -> Policy:
     cfg = experiment_from_plain(manifest["config"], str(checkpoint))
     set_up_torch(1)  # a forward pass is little beside the physics, and waiting threads take the cores from it
     cfg = dataclasses.replace(cfg, run=dataclasses.replace(cfg.run, device=device, env_device=device))
+    correction = load_correction(checkpoint, device)
+    act = actor if correction is None else CorrectedPolicy(actor, correction)
     env_steps = manifest["env_steps"] if checkpoint.suffix == SUFFIX else training_steps(checkpoint)
-    return Policy(checkpoint, actor, cfg, manifest["sha256"], env_steps)
+    return Policy(checkpoint, actor, act, cfg, manifest["sha256"], env_steps)
 
 
 def chosen_robots(text: str | None, cfg: ExperimentCfg) -> tuple[str, ...]:

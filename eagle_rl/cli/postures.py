@@ -35,7 +35,7 @@ def strips(policy: Policy, robots: Sequence[str], posture: str) -> dict[str, Str
 def _strip(policy: Policy, robot: str, script: CommandScript, column: int, unit: str) -> Strip:
     """One robot's pictures."""
     steps = round(script.duration / CONTROL_STEP)
-    session = Session(policy.actor, policy.cfg, [robot], num_steps=steps)
+    session = Session(policy.act, policy.cfg, [robot], num_steps=steps)
     picks, strip = set(evenly(steps, PICTURES)), []
     with OffscreenRenderer(Stage(session.specs), *SIZE, FROM_THE_SIDE) as renderer:
         for step in range(steps):

@@ -16,7 +16,7 @@ from envs.humanoid_env import HumanoidEnv
 from envs.robots.load import load_robot
 
 if TYPE_CHECKING:
-    from eagle_rl.models import EagleActor
+    from eagle_rl.evaluation.evaluate import Policy
 
 Array = NDArray[np.float64]
 
@@ -33,14 +33,14 @@ class Session:
         falls: times [s] at which each robot fell, by name.
     """
 
-    def __init__(self, actor: EagleActor, cfg: ExperimentCfg, robots: Sequence[str], num_steps: int) -> None:
+    def __init__(self, policy: Policy, cfg: ExperimentCfg, robots: Sequence[str], num_steps: int) -> None:
         """Place one environment per robot; none times out within ``num_steps`` control steps."""
         self.cfg = cfg
         self.specs = [load_robot(name) for name in robots]
         protocol = dataclasses.replace(cfg.evaluation, num_steps=num_steps, randomization=False, noise=False)
         task = evaluation_task(cfg.task, protocol)
         self._env = HumanoidEnv(task, self.specs, len(self.specs), protocol.seed, num_threads=1)
-        self._actor = actor
+        self._policy = policy
         self.step_dt = self._env.step_dt
         self.num_steps = 0
         self.falls: dict[str, list[float]] = {spec.name: [] for spec in self.specs}
@@ -65,7 +65,7 @@ class Session:
         """Advance one control step under a command for all, shape (5,)."""
         rows = torch.as_tensor(command, dtype=torch.float32).expand(len(self.specs), 5)
         self._env.pin_commands(rows)
-        _, _, dones, _ = self._env.step(self._actor(self._env.get_observations()))
+        _, _, dones, _ = self._env.step(self._policy(self._env.get_observations()))
         self.num_steps += 1
         for row in dones.nonzero().flatten().tolist():
             self.falls[self.specs[row].name].append(self.time)

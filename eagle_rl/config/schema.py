@@ -148,6 +148,8 @@ class PlanCfg:
     spent on continuing from it."""
     search_env_steps: int = 0
     """Budget of the search that follows each specialist's training; 0 for none (ours)."""
+    correction_env_steps: int = 0
+    """Budget of the probes from which each specialist's errors are corrected in the end; 0 for none (ours)."""
     judge_envs_per_robot: int = 64
     """Environments per robot in the evaluation that ends each stage and decides on convergence; 0 leaves it out."""
 
@@ -177,6 +179,25 @@ class SearchCfg:
     randomized_share: float = 0.5
     """Share of pairs in the world of training, with its bodies, motors, noise and pushes [-]; the best where nothing
     disturbs falls more where something does."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CorrectionCfg:
+    """Correction of a specialist by what its errors have of command and phase (ours; docs/experiments.md, 22).
+
+    Errors weigh as in the search, by ``search.error_units``.
+    """
+
+    num_envs: int = 768
+    """Robots in a rollout; a probe takes three rollouts [-]."""
+    num_steps: int = 220
+    """Control steps of a rollout, from rest."""
+    settling_steps: int = 60
+    """The first of them, which are not looked at."""
+    std: float = 0.03
+    """Of the changes tried, in units of action, for every joint and harmonic [-]."""
+    damping: float = 6.0
+    """Number of error units that weigh as much as a change of one unit of action [-]; with less of it robots fall."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -232,5 +253,6 @@ class ExperimentCfg:
     algo: AlgoCfg = field(default_factory=AlgoCfg)
     plan: PlanCfg = field(default_factory=PlanCfg)
     search: SearchCfg = field(default_factory=SearchCfg)
+    correction: CorrectionCfg = field(default_factory=CorrectionCfg)
     evaluation: EvaluationCfg = field(default_factory=EvaluationCfg)
     run: RunCfg = field(default_factory=RunCfg)

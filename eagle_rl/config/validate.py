@@ -44,6 +44,7 @@ BOUNDS: dict[str, _Bound] = dict.fromkeys(
     algo.desired_kl algo.max_grad_norm algo.network.embedding_dim algo.network.init_std
     plan.generalist_env_steps plan.max_rounds
     search.num_pairs search.num_steps search.num_directions search.std search.step
+    correction.num_envs correction.num_steps correction.std correction.damping
     evaluation.num_envs_per_robot evaluation.num_steps evaluation.physics_dt evaluation.decimation
     run.save_interval run.keep_checkpoints
     """.split(),
@@ -78,6 +79,8 @@ CEILINGS: dict[str, float] = {
     "search.num_pairs": 1e6,
     "search.num_steps": 1e6,
     "search.num_directions": 1e5,
+    "correction.num_envs": 1e5,
+    "correction.num_steps": 1e6,
     "plan.judge_envs_per_robot": 1e6,
     "plan.specialist_num_envs": 1e6,
     "evaluation.num_steps": 1e6,
@@ -218,13 +221,15 @@ def _plan_faults(cfg: ExperimentCfg) -> Iterator[Fault]:
         yield "num_envs", f"{cfg.num_envs} is less than one environment for each of {len(cfg.robots)} robots"
     plan = cfg.plan
     if plan.method != "ppo":
-        specialists = plan.specialist_env_steps + (0 if plan.method == "compass" else plan.search_env_steps)
+        others = 0 if plan.method == "compass" else plan.search_env_steps + plan.correction_env_steps
+        specialists = plan.specialist_env_steps + others
         budgets = {"specialist_env_steps": specialists, "distill_env_steps": plan.distill_env_steps}
         for key in (key for key, budget in budgets.items() if budget == 0):
             yield f"plan.{key}", f"0, but method {plan.method} needs a budget for this stage"
-    steps, settling = cfg.search.num_steps, cfg.search.settling_steps
-    if steps <= settling:
-        yield "search.num_steps", f"got {steps}, expected more than search.settling_steps, {settling}"
+    for name, rollout in (("search", cfg.search), ("correction", cfg.correction)):
+        steps, settling = rollout.num_steps, rollout.settling_steps
+        if steps <= settling:
+            yield f"{name}.num_steps", f"got {steps}, expected more than {name}.settling_steps, {settling}"
     for key in ("device", "env_device"):
         if not re.fullmatch(r"cpu|cuda(:\d+)?", getattr(cfg.run, key)):
             yield f"run.{key}", f"got {getattr(cfg.run, key)!r}, expected cpu, cuda or cuda:N"

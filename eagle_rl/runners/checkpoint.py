@@ -23,6 +23,7 @@ import torch
 
 from eagle_rl.errors import CheckpointError, EagleWarning
 from eagle_rl.models import EagleActor
+from eagle_rl.models.correction import Correction
 from eagle_rl.runners import published
 from eagle_rl.runners.files import write_atomically
 from eagle_rl.runners.provenance import Provenance
@@ -131,6 +132,13 @@ def load_actor(
     except (KeyError, TypeError, AttributeError, RuntimeError, ValueError) as error:
         raise CheckpointError(f"{path}: does not hold a policy of this version: {error}") from error
     return actor.to(device).eval(), manifest
+
+
+def load_correction(path: Path, device: str | torch.device = "cpu") -> Correction | None:
+    """What a checkpoint's policy is corrected by, if anything; a published policy has nothing of the kind."""
+    path = Path(path)
+    saved = None if path.suffix == published.SUFFIX else load_checkpoint(path, device=device).state.get("correction")
+    return None if saved is None else Correction(**saved)
 
 
 def publish_policy(path: Path, target: Path, env_steps: int | None = None) -> Path:

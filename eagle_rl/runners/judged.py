@@ -14,6 +14,7 @@ _POLICIES = {
     "specialist": "specialist",
     "residual": "specialist",
     "search": "searched specialist",
+    "correct": "corrected specialist",
     "base": "base",
     "average": "averaged",
 }

@@ -1,8 +1,8 @@
 """Algorithm 1 of the paper as data: which stages an experiment consists of, what each starts from and what it costs.
 
 Line 1 of the algorithm is the stage ``generalist`` (or ``root``, when the experiment forks from a checkpoint); lines
-3-4 are ``roundR/specialist_ROBOT`` and, ours, ``roundR/search_ROBOT``; lines 5-9 are ``roundR/distill`` and, ours,
-``roundR/average``. Nothing here imports torch.
+3-4 are ``roundR/specialist_ROBOT`` and, ours, ``roundR/search_ROBOT`` and ``roundR/correct_ROBOT``; lines 5-9 are
+``roundR/distill`` and, ours, ``roundR/average``. Nothing here imports torch.
 """
 
 from __future__ import annotations
@@ -14,10 +14,12 @@ from typing import Literal
 
 from eagle_rl.config.schema import ExperimentCfg, TaskCfg
 
-Kind = Literal["root", "generalist", "continued", "specialist", "search", "distill", "average", "base", "residual"]
+Kind = Literal[
+    "root", "generalist", "continued", "specialist", "search", "correct", "distill", "average", "base", "residual"
+]
 Imitation = Literal["eagle", "kickstart"]
 
-ALONE: tuple[Kind, ...] = ("specialist", "search", "residual")
+ALONE: tuple[Kind, ...] = ("specialist", "search", "correct", "residual")
 """What improves one robot."""
 
 
@@ -33,7 +35,7 @@ class Stage:
     env_steps: int
     """Budget; one robot, one 50 Hz control step is 1."""
     iterations: int
-    """The budget in whole learning iterations, or generations of a search, rounded up."""
+    """The budget in whole learning iterations, generations of a search or probes of a correction, rounded up."""
     init: str | None = None
     """Stage whose final weights this one starts from."""
     teachers: tuple[str, ...] = ()
@@ -64,7 +66,8 @@ class Stage:
     @property
     def position(self) -> float:
         """Where its policy stands among the rounds: specialists before the generalist they teach, an average after."""
-        return self.round - {"specialist": 0.5, "residual": 0.5, "search": 0.25, "average": -0.2}.get(self.kind, 0.0)
+        before = {"specialist": 0.5, "residual": 0.5, "search": 0.25, "correct": 0.15, "average": -0.2}
+        return self.round - before.get(self.kind, 0.0)
 
     @property
     def specialised(self) -> bool:
@@ -91,6 +94,8 @@ def _stage(cfg: ExperimentCfg, name: str, kind: Kind, env_steps: int, **rest: ob
     """A stage with its budget in iterations and a seed of its own."""
     if kind == "search":
         steps = 2 * cfg.search.num_pairs * cfg.search.num_steps
+    elif kind == "correct":
+        steps = 3 * cfg.correction.num_envs * cfg.correction.num_steps
     else:
         steps = stage_num_envs(cfg, kind) * cfg.algo.num_steps_per_env
     fields = {
@@ -103,8 +108,12 @@ def _stage(cfg: ExperimentCfg, name: str, kind: Kind, env_steps: int, **rest: ob
 
 
 def _specialist(cfg: ExperimentCfg, number: int, robot: str, generalist: str) -> list[Stage]:
-    """Training and search of one specialist, whichever of them has a budget."""
-    budgets: dict[Kind, int] = {"specialist": cfg.plan.specialist_env_steps, "search": cfg.plan.search_env_steps}
+    """Training, search and correction of one specialist, whichever of them has a budget."""
+    budgets: dict[Kind, int] = {
+        "specialist": cfg.plan.specialist_env_steps,
+        "search": cfg.plan.search_env_steps,
+        "correct": cfg.plan.correction_env_steps,
+    }
     stages: list[Stage] = []
     for kind, budget in budgets.items():
         if budget:

@@ -18,15 +18,18 @@ from eagle_rl.config.schema import ExperimentCfg
 from eagle_rl.errors import CheckpointError
 from eagle_rl.evaluation.evaluate import MakeEnv, Policy
 from eagle_rl.models import EagleActor
+from eagle_rl.models.correction import CorrectedPolicy
 from eagle_rl.runners.checkpoint import (
     latest_checkpoint,
     load_actor,
     load_checkpoint,
+    load_correction,
     read_manifest,
     save_checkpoint,
     verify_checkpoint,
 )
 from eagle_rl.runners.compass import DemonstrationEnv, ResidualBank, ResidualEnv, ResidualPolicy, begin_residual
+from eagle_rl.runners.correcting import CorrectionRunner
 from eagle_rl.runners.files import patiently, write_atomically
 from eagle_rl.runners.locate import find_checkpoint
 from eagle_rl.runners.on_policy import EagleRunner, make_train_cfg
@@ -81,6 +84,8 @@ def train(job: Job) -> Path:
         return _copy_root(job, checkpoints)
     if job.stage.kind == "search":
         return _search(job, latest)
+    if job.stage.kind == "correct":
+        return _correct(job)
     if job.stage.kind == "average":
         return _average(job)
     runner = _make_runner(job)
@@ -101,6 +106,16 @@ def _search(job: Job, latest: Path | None) -> Path:
         if latest is not None:
             runner.load(latest)
         return runner.run(job.check_claim)
+    return job.folder / "checkpoints" / f"model_{job.stage.iterations}.pt"
+
+
+def _correct(job: Job) -> Path:
+    """Correct a policy; only the first of several processes does, the others wait."""
+    if job.rank == 0:
+        assert job.init is not None, "a correction is one of a policy"
+        return CorrectionRunner(job.cfg, job.stage, job.init, job.folder, job.make_env, job.provenance).run(
+            job.check_claim
+        )
     return job.folder / "checkpoints" / f"model_{job.stage.iterations}.pt"
 
 
@@ -159,7 +174,9 @@ def _teachers(job: Job, base: EagleActor | None, device: str) -> SpecialistBank 
     actors = [load_actor(path, device)[0] for path in job.teachers]
     if not actors:
         return None
-    return SpecialistBank(actors) if base is None else ResidualBank(base, actors)
+    if base is not None:
+        return ResidualBank(base, actors)
+    return SpecialistBank(actors, [load_correction(path, device) for path in job.teachers])
 
 
 def load_policy(job: Job, checkpoint: Path) -> Policy:
@@ -167,7 +184,10 @@ def load_policy(job: Job, checkpoint: Path) -> Policy:
     device = job.cfg.run.env_device
     actor = load_actor(checkpoint, device)[0]
     base = _load(job.base, device) if job.stage.kind == "residual" else None
-    return actor if base is None else ResidualPolicy(base, actor)
+    if base is not None:
+        return ResidualPolicy(base, actor)
+    correction = load_correction(checkpoint, device)
+    return actor if correction is None else CorrectedPolicy(actor, correction)
 
 
 def _copy_root(job: Job, checkpoints: Path) -> Path:

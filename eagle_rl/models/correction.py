@@ -1,0 +1,92 @@
+"""A policy with a correction: something added to its command and its action that depends on command and phase alone."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from itertools import combinations_with_replacement
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from eagle_rl.models.actor import ACTOR_INPUTS, EagleActor
+
+NUM_HARMONICS = 5
+"""Highest multiple of the gait's frequency that is added to an action; 50 Hz make 20 to 25 steps of a cycle."""
+NUM_SHIFTS = 3
+"""The commands a policy can be told more or less of: its velocities, which it follows by itself. What it is told of a
+posture hardly moves it, since its resting pose is bent (docs/experiments.md, 22)."""
+SHIFT_UNIT = 5.0
+"""Change of a scaled command by a coefficient of 1 [-]: one of an action and one of a command then weigh alike."""
+STANDING_CLOCK = 0.999
+"""Both feet's clocks are above this only where the robot stands, which is not corrected."""
+
+
+def waves(phase: Tensor, num_harmonics: int) -> Tensor:
+    """1, cos 2 pi phi, sin 2 pi phi, cos 4 pi phi, ... of phases (...) [cycles], shape (..., 2 num_harmonics + 1)."""
+    angle = 2.0 * math.pi * phase.unsqueeze(-1) * torch.arange(1, num_harmonics + 1, device=phase.device)
+    both = torch.stack((torch.cos(angle), torch.sin(angle)), dim=-1).flatten(-2)
+    return torch.cat((torch.ones_like(phase).unsqueeze(-1), both), dim=-1)
+
+
+def monomials(x: Tensor) -> Tensor:
+    """1, every number of ``x`` (N, 5) and every product of two of them, shape (N, 21)."""
+    pairs = [x[:, i] * x[:, j] for i, j in combinations_with_replacement(range(x.shape[1]), 2)]
+    return torch.cat((torch.ones_like(x[:, :1]), x, torch.stack(pairs, dim=1)), dim=1)
+
+
+@dataclass(frozen=True)
+class Correction:
+    """Coefficients of :func:`waves` for every joint, and of the commands, as polynomials of the command."""
+
+    weights: Tensor
+    """Shape (21, S (2 NUM_HARMONICS + 1) + NUM_SHIFTS)."""
+    slots: Tensor
+    """Slots that are corrected, shape (S,)."""
+    middle: Tensor
+    """Of the scaled commands' ranges, shape (5,)."""
+    half_range: Tensor
+    """Half the width of those, shape (5,)."""
+
+    def normalised(self, command: Tensor) -> Tensor:
+        """Scaled commands (N, 5) as shares of their ranges, in [-1, 1]; beyond these a polynomial would run away."""
+        return ((command - self.middle) / self.half_range).clamp(-1.0, 1.0)
+
+    def coefficients(self, command: Tensor) -> Tensor:
+        """Of scaled commands (N, 5), shape (N, S (2 NUM_HARMONICS + 1) + NUM_SHIFTS)."""
+        return monomials(self.normalised(command)) @ self.weights
+
+    def act(self, actor: EagleActor, obs: TensorDict, extra: Tensor | float = 0.0) -> Tensor:
+        """Mean actions (N, 32) of the corrected policy.
+
+        Args:
+            actor: the policy.
+            obs: the groups it reads, ``slot_mask`` and ``phase``.
+            extra: added to the coefficients, the same shape.
+        """
+        history, command, clock = (obs[group] for group in ACTOR_INPUTS)
+        walks = clock.amin(dim=1, keepdim=True) < STANDING_CLOCK
+        coefficients = (self.coefficients(command) + extra) * walks
+        shift = torch.zeros_like(command)
+        shift[:, :NUM_SHIFTS] = SHIFT_UNIT * coefficients[:, -NUM_SHIFTS:]
+        actions = actor.mean_actions(history, command + shift, clock, obs["slot_mask"])
+        by_joint = coefficients[:, :-NUM_SHIFTS].unflatten(1, (len(self.slots), -1))
+        more = (by_joint * waves(obs["phase"], NUM_HARMONICS).unsqueeze(1)).sum(dim=2)
+        return actions.index_add(1, self.slots, more)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Arguments of the constructor."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+
+class CorrectedPolicy:
+    """The deterministic policy of actor and correction together."""
+
+    def __init__(self, actor: EagleActor, correction: Correction) -> None:
+        """Correct ``actor``."""
+        self.actor, self.correction = actor, correction
+
+    def __call__(self, obs: TensorDict) -> Tensor:
+        """Mean actions, shape (N, 32)."""
+        return self.correction.act(self.actor, obs)

@@ -1,0 +1,169 @@
+"""The stage that takes off what of a policy's errors repeats with the gait, on its one robot."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.console import Console
+from torch import Tensor
+
+from eagle_rl.algorithms.correction import Mirror, Probe, error_waves, improve
+from eagle_rl.config.schema import EvaluationCfg, ExperimentCfg
+from eagle_rl.evaluation.evaluate import MakeEnv
+from eagle_rl.evaluation.protocol import COMMANDS, draw_commands, evaluation_task
+from eagle_rl.models.correction import NUM_HARMONICS, NUM_SHIFTS, Correction, monomials
+from eagle_rl.runners import checkpoint as ckpt
+from eagle_rl.runners.files import patiently
+from eagle_rl.runners.plan import Stage
+from eagle_rl.runners.provenance import Provenance
+
+GAINS = (1.0, 0.5, 0.25)
+"""Shares of a step that are tried, in turn, until one makes the cost less: after a whole one a robot may fall."""
+
+
+@dataclass(frozen=True)
+class _Rollout:
+    """What came of M robots."""
+
+    command: Tensor
+    """As the policy saw it, shape (M, 5)."""
+    waves: Tensor
+    """Of the errors in multiples of their units, shape (M, 5, B)."""
+    cost: Tensor
+    """Mean error in multiples of the units, of who falls that of the largest commands there are, shape (M,)."""
+    fell: Tensor
+    """Bool, shape (M,)."""
+
+
+class CorrectionRunner:
+    """Corrects the policy of a checkpoint, of whose learner nothing changes.
+
+    It takes a minute or two an iteration and starts anew if it is stopped.
+    """
+
+    def __init__(
+        self, cfg: ExperimentCfg, stage: Stage, init: Path, folder: Path, make_env: MakeEnv, provenance: Provenance
+    ) -> None:
+        """Take the learner of ``init``; write into ``folder``."""
+        self.cfg, self.stage, self.folder, self.provenance = cfg, stage, folder, provenance
+        self._make_env = make_env
+        self._learner = ckpt.load_checkpoint(init, provenance.slot_table_hash).state
+        self._actor = ckpt.load_actor(init, cfg.run.env_device)[0]
+        sim = cfg.task.sim
+        self._ev = EvaluationCfg(
+            num_steps=cfg.correction.num_steps, physics_dt=sim.physics_dt, decimation=sim.decimation
+        )
+        self._units = torch.tensor(cfg.search.error_units, device=cfg.run.env_device)
+        self._limits = torch.tensor(
+            [getattr(cfg.task.commands, name).finishing for name in COMMANDS], device=cfg.run.env_device
+        )
+        self.env_steps = 0
+
+    @torch.no_grad()
+    def run(self, on_iteration: Callable[[], None] = lambda: None) -> Path:
+        """Correct as often as the stage says, or until nothing gets better, then save.
+
+        Returns:
+            The checkpoint.
+        """
+        start = time.perf_counter()
+        correction, mirror = self._begin()
+        for iteration in range(self.stage.iterations):
+            probe = self._probe(correction, 2 * iteration)
+            step = improve(correction, probe, mirror, self.cfg.correction.std, self.cfg.correction.damping)
+            better = self._better(correction, step, 2 * iteration + 1)
+            on_iteration()
+            if better is None:
+                break
+            correction = better
+        return patiently(lambda: self._save(correction, time.perf_counter() - start))
+
+    def _begin(self) -> tuple[Correction, Mirror]:
+        """No correction yet, and the robot's mirror."""
+        env = self._env(2)
+        env.pin_commands(self._limits.T)
+        obs = env.get_observations()
+        low, high = obs["command"]
+        slots = obs["slot_mask"][0].nonzero().flatten()
+        perm, sign = env.mirror["actions"]
+        width = len(slots) * (2 * NUM_HARMONICS + 1) + NUM_SHIFTS
+        correction = Correction(
+            weights=low.new_zeros(monomials(obs["command"]).shape[1], width),
+            slots=slots,
+            middle=(low + high) / 2,
+            half_range=(high - low) / 2,
+        )
+        partner = (perm[slots].unsqueeze(1) == slots).int().argmax(dim=1)
+        return correction, Mirror(command=env.mirror["command"], partner=partner, sign=sign[slots])
+
+    def _probe(self, correction: Correction, number: int) -> Probe:
+        """Robots with a change, with its negative and without; those that fell are left out."""
+        generator = torch.Generator().manual_seed(self.stage.seed + number)
+        change = torch.randn(self.cfg.correction.num_envs, correction.weights.shape[1], generator=generator)
+        change = self.cfg.correction.std * change.to(correction.weights)
+        more, less, plain = (self._follow(correction, number, way * change) for way in (1.0, -1.0, 0.0))
+        answer = 0.5 * (more.waves - less.waves)
+        probe = Probe(command=plain.command, change=change, answer=answer, error=plain.waves)
+        return probe.of(~(more.fell | less.fell | plain.fell))
+
+    def _better(self, correction: Correction, step: Tensor, number: int) -> Correction | None:
+        """The correction a share of a step further on with which commands that were not probed are followed better."""
+        before = self._follow(correction, number).cost.mean().item()
+        for gain in GAINS:
+            candidate = replace(correction, weights=correction.weights + gain * step)
+            after = self._follow(candidate, number).cost.mean().item()
+            outcome = f"{self.stage.name}: cost {before:.3f} -> {after:.3f} with {gain:.0%} of the step"
+            Console(stderr=True).print(outcome, highlight=False)
+            if after < before:
+                return candidate
+        return None
+
+    def _env(self, num_envs: int) -> Any:
+        """Environments in the physics of training, undisturbed, in the same state every time."""
+        task = evaluation_task(self.cfg.task, self._ev)
+        return self._make_env(self.cfg.robots, num_envs, task, self.stage.seed)
+
+    def _follow(self, correction: Correction, number: int, change: Tensor | float = 0.0) -> _Rollout:
+        """Let robots follow the commands of this number from rest, with coefficients changed."""
+        correcting = self.cfg.correction
+        ev = replace(self._ev, seed=self.stage.seed + number)
+        drawn = draw_commands(self.cfg.task.commands, ev, self.cfg.robots[0], correcting.num_envs)
+        commands = drawn[:, 0].to(self._units)
+        env = self._env(correcting.num_envs)
+        env.pin_commands(commands)
+        obs = env.get_observations()
+        seen = obs["command"]
+        fell = torch.zeros(len(commands), dtype=torch.bool, device=commands.device)
+        errors, phases = [], []
+        for _ in range(correcting.num_steps):
+            obs, _, dones, extras = env.step(correction.act(self._actor, obs, change))
+            fell |= dones.bool() & ~extras["time_outs"].bool()
+            errors.append((env.measured_commands().to(commands) - commands) / self._units)
+            phases.append(obs["phase"])
+        self.env_steps += len(commands) * correcting.num_steps
+        signed = torch.stack(errors)[correcting.settling_steps :]
+        worst = (self._limits.abs().amax(dim=1) / self._units).mean()
+        cost = torch.where(fell, worst, signed.abs().mean(dim=(0, 2)))
+        found = error_waves(signed, torch.stack(phases)[correcting.settling_steps :])
+        return _Rollout(command=seen, waves=found, cost=cost, fell=fell)
+
+    def _save(self, correction: Correction, seconds: float) -> Path:
+        """Write a checkpoint that other stages start from as from any other."""
+        iterations = self.stage.iterations
+        state = self._learner | {
+            "runner": {"next_iteration": iterations, "env_steps": self.env_steps, "wall_time": seconds},
+            "correction": correction.state_dict(),
+        }
+        return ckpt.save_checkpoint(
+            self.folder / "checkpoints",
+            state,
+            self.provenance,
+            iteration=iterations,
+            env_steps=self.env_steps,
+            stage_end=True,
+        )
