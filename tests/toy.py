@@ -64,6 +64,7 @@ class ToyEnv(VecEnv):
             "critic": torch.cat([current, self.command, self.mass], dim=1),
             "estimate": torch.cat([speed, self.mass * torch.linspace(0.1, 1.0, 30)], dim=1),
             "slot_mask": self.mask.clone(),
+            "phase": 0.1 * self.episode_length_buf,
             "robot": self.robot.clone(),
         }
         return TensorDict(groups, batch_size=[self.num_envs])

@@ -86,7 +86,7 @@ def error_waves(errors: Tensor, phases: Tensor) -> Tensor:
         Shape (M, 5, 2 ERROR_HARMONICS + 1), of equal weight in the mean square over time.
     """
     basis = waves(phases.T, ERROR_HARMONICS)
-    found = torch.linalg.lstsq(basis, errors.transpose(0, 1)).solution.transpose(1, 2)
+    found = _ridge(basis, errors.transpose(0, 1), ridge=1e-4 * len(errors)).transpose(1, 2)
     found[..., 1:] *= math.sqrt(0.5)
     return found
 
@@ -135,5 +135,6 @@ def _solve(context: Tensor, answer: Tensor, error: Tensor, damping: float) -> Te
 
 
 def _ridge(basis: Tensor, values: Tensor, ridge: float = 0.1) -> Tensor:
-    """Coefficients (F, A) with which a basis (M, F) comes closest to values (M, A)."""
-    return torch.linalg.solve(basis.T @ basis + ridge * torch.eye(basis.shape[1]).to(basis), basis.T @ values)
+    """Coefficients (..., F, A) with which a basis (..., M, F) comes closest to values (..., M, A)."""
+    normal = basis.mT @ basis + ridge * torch.eye(basis.shape[-1]).to(basis)
+    return torch.linalg.solve(normal, basis.mT @ values)

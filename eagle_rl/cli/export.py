@@ -129,6 +129,11 @@ def main(argv: Sequence[str]) -> int:
     from eagle_rl.runners.checkpoint import publish_policy
 
     policy = load_policy(args.checkpoint)
+    if policy.act is not policy.actor:
+        raise ConfigError(
+            f"{policy.checkpoint}: a corrected specialist, whose correction reads the gait's phase, which no exported "
+            "policy gets. Export the generalist that was distilled from it, or the stage before the correction."
+        )
     if args.publish is not None:
         policy = load_policy(publish_policy(policy.checkpoint, args.publish, policy.env_steps))
         print(f"{policy.checkpoint}, with its manifest in {policy.checkpoint.with_suffix('.json').name}")

@@ -47,6 +47,7 @@ def test_observations_have_the_announced_shapes(embodiment: bool, dtype: torch.d
             "critic": (5, env.layout.size("critic")),
             "estimate": (5, 33 if embodiment else 3),
             "slot_mask": (5, 32),
+            "phase": (5,),
             "robot": (5,),
         }
         assert all(x.dtype == torch.float32 for name, x in group.items() if name != "robot")

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 
 import pytest
+import torch
 
 from eagle_rl.cli.environment import make_env_factory
 from eagle_rl.cli.evaluate import main
+from eagle_rl.cli.export import main as export
+from eagle_rl.cli.policy import load_policy
 from eagle_rl.config.load import load_experiment
 from eagle_rl.errors import ConfigError
 from eagle_rl.evaluation.evaluate import EvaluationResult
+from eagle_rl.models.correction import CorrectedPolicy
 from eagle_rl.runners.provenance import Provenance, slot_table_hash
+from eagle_rl.runners.records import final_checkpoint
 from eagle_rl.runners.stages import run_experiment
 from envs.robots.slots import SLOT_NAMES
 
@@ -24,6 +30,35 @@ def run(tmp_path_factory):
     cfg = load_experiment("smoke", ["robots=[h1]", "plan.method=ppo", "plan.judge_envs_per_robot=0", "seed=7"])
     provenance = Provenance(slot_table_hash=slot_table_hash(SLOT_NAMES))
     return run_experiment(cfg, tmp_path_factory.mktemp("run"), make_env_factory(cfg.run), provenance=provenance)
+
+
+@pytest.fixture(scope="module")
+def corrected(tmp_path_factory):
+    """A specialist of the smoke experiment with a correction of its own."""
+    overrides = ["robots=[h1]", "plan.specialist_env_steps=0", "plan.correction_env_steps=1", "correction.num_envs=4"]
+    overrides += ["correction.num_steps=30", "correction.settling_steps=5", "plan.judge_envs_per_robot=0"]
+    cfg = load_experiment("smoke", overrides)
+    provenance = Provenance(slot_table_hash=slot_table_hash(SLOT_NAMES))
+    result = run_experiment(cfg, tmp_path_factory.mktemp("run"), make_env_factory(cfg.run), provenance=provenance)
+    return final_checkpoint(result.run_dir, "round1/correct_h1")
+
+
+def test_a_corrected_specialist_is_judged_with_its_correction(corrected):
+    policy = load_policy(corrected)
+    assert isinstance(policy.act, CorrectedPolicy)
+    env = make_env_factory(policy.cfg.run)(["h1"], 2, policy.cfg.task, 1)
+    obs = env.get_observations()
+    weights = torch.full_like(policy.act.correction.weights, 0.1)
+    policy.act.correction = dataclasses.replace(policy.act.correction, weights=weights)
+    differs = (policy.act(obs) - policy.actor(obs)).abs()
+    assert (differs[:, obs["slot_mask"][0] > 0] > 0).any()
+    assert not differs[:, obs["slot_mask"][0] == 0].any(), "joints H1 does not have"
+    assert main([f"corrected={corrected}", *QUICK]) == 0
+
+
+def test_a_corrected_specialist_is_not_exported_without_its_correction(corrected):
+    with pytest.raises(ConfigError, match="Export the generalist that was distilled from it"):
+        export([str(corrected)])
 
 
 def test_a_run_becomes_a_table_with_hash_protocol_and_seed(run, tmp_path, capsys):

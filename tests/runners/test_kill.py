@@ -20,6 +20,7 @@ from tests.runners.toy_run import STEPS, JudgedToyEnv, parameters, toy_experimen
 
 EAGLE = toy_experiment(iterations=3)
 SEARCH = toy_experiment(iterations=3, search_env_steps=12 * 40)
+CORRECT = toy_experiment(iterations=3, correction_env_steps=1)
 COMPASS = toy_experiment(iterations=3, method="compass")
 MID_ITERATION = 2 * STEPS + 1
 """Control steps of a stage before its process dies: in its last iteration, two checkpoints written."""
@@ -65,7 +66,7 @@ def run_until_killed(cfg: ExperimentCfg, folder: Path, seed: int, steps: int) ->
 
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded, use of fork")
 @pytest.mark.filterwarnings("ignore:.*nothing better found")
-@pytest.mark.parametrize("cfg", [EAGLE, COMPASS, SEARCH], ids=["eagle", "compass", "search"])
+@pytest.mark.parametrize("cfg", [EAGLE, COMPASS, SEARCH, CORRECT], ids=["eagle", "compass", "search", "correct"])
 def test_killed_in_every_stage_a_run_ends_with_the_same_parameters(cfg, tmp_path):
     whole = run_experiment(cfg, tmp_path / "whole", MakeEnv(None, 0))
     folder = tmp_path / "killed"

@@ -47,6 +47,16 @@ def test_a_search_follows_each_specialists_training_and_ends_with_the_teacher():
     assert search.specialised
 
 
+def test_a_correction_follows_the_search_and_ends_with_the_teacher():
+    stages = {stage.name: stage for stage in plan(search_env_steps=1, correction_env_steps=3 * 768 * 220 + 1)}
+    correct = stages["round2/correct_g1"]
+    assert correct.inputs == ("round2/search_g1",)
+    assert correct.iterations == 2, "probes of three rollouts of 768 robots and 220 steps"
+    assert stages["round2/distill"].teachers[1] == correct.name
+    assert correct.specialised
+    assert stages["round2/search_g1"].position < correct.position < stages["round2/distill"].position
+
+
 def test_specialists_stand_half_a_round_before_the_generalist_they_teach_searched_ones_a_quarter():
     stages = {stage.name: stage.position for stage in plan(search_env_steps=1)}
     assert stages["generalist"] == 0

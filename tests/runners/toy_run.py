@@ -9,6 +9,7 @@ from torch import Tensor
 
 from eagle_rl.config.schema import (
     AlgoCfg,
+    CorrectionCfg,
     EvaluationCfg,
     ExperimentCfg,
     NetworkCfg,
@@ -43,8 +44,11 @@ class JudgedToyEnv(ToyEnv):
         if self.pinned is not None:
             self.command = self.pinned.float()
 
+    def measured_commands(self) -> Tensor:
+        return self.frames[:, 0, :5]
+
     def tracking_errors(self) -> Tensor:
-        return (self.frames[:, 0, :5] - self.command).abs()
+        return (self.measured_commands() - self.command).abs()
 
 
 def make_toy_env(robots: Sequence[str], num_envs: int, task: TaskCfg, seed: int, first: int = 0) -> JudgedToyEnv:
@@ -64,6 +68,7 @@ def toy_experiment(iterations: int = 3, judge_envs: int = 4, **plan: object) -> 
         algo=AlgoCfg(num_steps_per_env=STEPS, num_learning_epochs=1, num_mini_batches=2, network=NETWORK),
         plan=PlanCfg(**{"method": "eagle", "judge_envs_per_robot": judge_envs, **budgets, **plan}),  # type: ignore[arg-type]
         search=SearchCfg(num_pairs=4, num_steps=5, settling_steps=1, resampling_time_s=0.04),
+        correction=CorrectionCfg(num_envs=4, num_steps=12, settling_steps=2),
         evaluation=EvaluationCfg(num_steps=5),
         run=RunCfg(save_interval=1, torch_threads=1),  # forked processes cannot use threads of their parent
     )

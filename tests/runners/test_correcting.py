@@ -1,0 +1,102 @@
+"""The stage that corrects, on the toy's robots."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import torch
+
+from eagle_rl.config.schema import CorrectionCfg, ExperimentCfg
+from eagle_rl.models.correction import CorrectedPolicy
+from eagle_rl.runners import correcting
+from eagle_rl.runners.checkpoint import load_actor, load_checkpoint, load_correction
+from eagle_rl.runners.plan import plan_stages
+from eagle_rl.runners.provenance import Provenance
+from eagle_rl.runners.records import final_checkpoint
+from eagle_rl.runners.stages import RunResult, run_experiment
+from eagle_rl.runners.training import Job, load_policy, train
+from tests.runners.test_searching import make_still_env
+from tests.runners.toy_run import toy_experiment
+
+CORRECTION = CorrectionCfg(num_envs=64, num_steps=12, settling_steps=2, damping=0.5)
+PROBE = 3 * 64 * 12
+"""Environment steps of a probe; each is followed by two to four looks of a third of that."""
+
+
+def corrected(folder: Path, probes: int = 2, **changes: float) -> tuple[ExperimentCfg, RunResult]:
+    plan = toy_experiment(iterations=1, specialist_env_steps=0, correction_env_steps=probes * PROBE)
+    cfg = dataclasses.replace(plan, correction=dataclasses.replace(CORRECTION, **changes))
+    return cfg, run_experiment(cfg, folder / "run", make_still_env)
+
+
+def errors(policy, robot: str) -> float:
+    """Mean error over the steps of a trial, commands drawn anew."""
+    env = make_still_env([robot], 64, None, seed=5)
+    env.pin_commands(0.2 * torch.rand(64, 5, generator=torch.Generator().manual_seed(3)) - 0.1)
+    found = []
+    for _ in range(12):
+        env.step(policy(env.get_observations()))
+        found.append(env.tracking_errors().mean())
+    return torch.stack(found[2:]).mean().item()
+
+
+def test_a_correction_makes_robots_follow_better_and_leaves_the_network_alone(tmp_path):
+    cfg, result = corrected(tmp_path)
+    root = load_actor(final_checkpoint(result.run_dir, "generalist"))[0]
+    for robot in cfg.robots:
+        path = final_checkpoint(result.run_dir, f"round1/correct_{robot}")
+        actor, correction = load_actor(path)[0], load_correction(path)
+        assert all(torch.equal(x, root.state_dict()[name]) for name, x in actor.state_dict().items()), robot
+        assert correction is not None
+        assert errors(CorrectedPolicy(actor, correction), robot) < 0.9 * errors(root, robot), robot
+
+
+def test_its_steps_are_counted(tmp_path):
+    _, result = corrected(tmp_path, probes=1)
+    spent = result.records["round1/correct_one"].env_steps
+    assert spent in [PROBE * (3 + looks) // 3 for looks in (2, 3, 4)]
+
+
+def test_it_is_judged_and_teaches_with_its_correction(tmp_path):
+    cfg, result = corrected(tmp_path)
+    path = final_checkpoint(result.run_dir, "round1/correct_two")
+    stage = next(stage for stage in plan_stages(cfg) if stage.name == "round1/correct_two")
+    assert isinstance(load_policy(job(cfg, stage), path), CorrectedPolicy)
+    distilled = load_checkpoint(final_checkpoint(result.run_dir, "round1/distill")).state
+    assert "correction" not in distilled, "a generalist has learned what it says"
+
+
+def test_a_correction_that_makes_nothing_better_is_dropped(tmp_path, monkeypatch):
+    monkeypatch.setattr(correcting, "improve", lambda correction, *_: torch.full_like(correction.weights, 3.0))
+    _, result = corrected(tmp_path)
+    path = final_checkpoint(result.run_dir, "round1/correct_one")
+    saved = load_correction(path)
+    assert saved is not None
+    assert not saved.weights.any(), "coefficients of 3 throw any robot over"
+
+
+def job(cfg: ExperimentCfg, stage, rank: int = 0) -> Job:
+    return Job(
+        cfg=cfg,
+        stage=stage,
+        folder=Path("stage"),
+        init=None,
+        teachers=(),
+        start=None,
+        base=None,
+        make_env=refuse,
+        provenance=Provenance(),
+        check_claim=lambda: None,
+        rank=rank,
+    )
+
+
+def refuse(*args: object) -> None:
+    raise AssertionError("nobody builds environments here")
+
+
+def test_only_the_first_of_several_processes_corrects():
+    cfg = toy_experiment(correction_env_steps=1)
+    stage = next(stage for stage in plan_stages(cfg) if stage.kind == "correct")
+    assert train(job(cfg, stage, rank=1)) == Path("stage/checkpoints/model_1.pt"), "what the leader is going to write"
