@@ -34,6 +34,7 @@ METHODS = {
     "fork_kickstarting": "Kickstarting",
     "fork_eagle": "EAGLE",
     "fork_search": "EAGLE, searched",
+    "fork_correct": "EAGLE, corrected",
     "fork_eagle_id": "EAGLE w/ ID",
 }
 """The paper's name for each of its experiments."""

@@ -32,6 +32,8 @@ POSTURE = "envs/robots/posture.py"
 RESTING = "envs/mdp/posture.py"
 SEARCH = "eagle_rl/algorithms/search.py"
 SEARCHING = "eagle_rl/runners/searching.py"
+CORRECTION = "eagle_rl/models/correction.py"
+CORRECTING = "eagle_rl/algorithms/correction.py"
 TRIALS = "eagle_rl/evaluation/trials.py"
 LOSSES = "eagle_rl/algorithms/losses.py"
 GAUSSIAN = "eagle_rl/models/distribution.py"
@@ -203,6 +205,20 @@ MUTANTS: tuple[Mutant, ...] = (
         "torch.lerp(x, weights[name], share)",
         "torch.lerp(weights[name], x, share)",
         "runners/test_stages.py",
+    ),
+    Mutant(CORRECTION, "SHIFT_UNIT * coefficients", "coefficients", "learner/test_correction.py"),
+    Mutant(CORRECTION, " + extra) * walks", " + extra)", "learner/test_correction.py"),
+    Mutant(CORRECTION, ".clamp(-1.0, 1.0)", "", "learner/test_correction.py"),
+    Mutant(
+        CORRECTING, "* _half_a_cycle(NUM_HARMONICS)", "* waves(sign, NUM_HARMONICS)[0]", "learner/test_correction.py"
+    ),
+    Mutant(CORRECTING, "return -effect @", "return effect @", "learner/test_correction.py"),
+    Mutant(CORRECTING, "found[..., 1:] *= ", "found[..., 2:] *= ", "learner/test_correction.py"),
+    Mutant(
+        "eagle_rl/runners/correcting.py",
+        "0.5 * (more.waves - less.waves)",
+        "0.5 * (less.waves - more.waves)",
+        "runners/test_correcting.py",
     ),
     Mutant(SEARCHING, "cost[1] - cost[0]", "cost[0] - cost[1]", "runners/test_searching.py"),
     Mutant(SEARCH, "better.clamp(-bound, bound)", "better", "learner/test_search.py"),
