@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,6 +15,7 @@ from torch import Tensor
 
 from eagle_rl.algorithms.correction import Mirror, Probe, error_waves, improve
 from eagle_rl.config.schema import EvaluationCfg, ExperimentCfg
+from eagle_rl.errors import EagleWarning
 from eagle_rl.evaluation.evaluate import MakeEnv
 from eagle_rl.evaluation.protocol import COMMANDS, draw_commands, evaluation_task
 from eagle_rl.models.correction import NUM_HARMONICS, NUM_SHIFTS, Correction, monomials
@@ -24,6 +26,9 @@ from eagle_rl.runners.provenance import Provenance
 
 GAINS = (1.0, 0.5, 0.25)
 """Shares of a step that are tried, in turn, until one makes the cost less: after a whole one a robot may fall."""
+
+MIN_SURVIVAL = 0.25
+"""Share of robots that must have stayed up with a change, with its negative and without."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +80,12 @@ class CorrectionRunner:
         correction, mirror = self._begin()
         for iteration in range(self.stage.iterations):
             probe = self._probe(correction, 2 * iteration)
+            if len(probe.command) < MIN_SURVIVAL * self.cfg.correction.num_envs:
+                text = (
+                    f"{self.stage.name}: most robots fell and taught nothing; a correction needs a policy that walks."
+                )
+                warnings.warn(text, EagleWarning, stacklevel=2)
+                break
             step = improve(correction, probe, mirror, self.cfg.correction.std, self.cfg.correction.damping)
             better = self._better(correction, step, 2 * iteration + 1)
             on_iteration()

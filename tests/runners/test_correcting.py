@@ -5,9 +5,11 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
+import pytest
 import torch
 
 from eagle_rl.config.schema import CorrectionCfg, ExperimentCfg
+from eagle_rl.errors import EagleWarning
 from eagle_rl.models.correction import CorrectedPolicy
 from eagle_rl.runners import correcting
 from eagle_rl.runners.checkpoint import load_actor, load_checkpoint, load_correction
@@ -16,7 +18,7 @@ from eagle_rl.runners.provenance import Provenance
 from eagle_rl.runners.records import final_checkpoint
 from eagle_rl.runners.stages import RunResult, run_experiment
 from eagle_rl.runners.training import Job, load_policy, train
-from tests.runners.test_searching import make_still_env
+from tests.runners.test_searching import StillToyEnv, make_still_env
 from tests.runners.toy_run import toy_experiment
 
 CORRECTION = CorrectionCfg(num_envs=64, num_steps=12, settling_steps=2, damping=0.5)
@@ -74,6 +76,28 @@ def test_a_correction_that_makes_nothing_better_is_dropped(tmp_path, monkeypatch
     saved = load_correction(path)
     assert saved is not None
     assert not saved.weights.any(), "coefficients of 3 throw any robot over"
+
+
+class FallingToyEnv(StillToyEnv):
+    """Robots that fall at every step, as those of an untrained policy soon do."""
+
+    def step(self, actions: torch.Tensor):
+        obs, rewards, dones, extras = super().step(actions)
+        return obs, rewards, torch.ones_like(dones), extras | {"time_outs": torch.zeros_like(dones)}
+
+
+def test_a_policy_that_cannot_walk_is_left_as_it_is_with_a_warning(tmp_path):
+    plan = toy_experiment(iterations=1, specialist_env_steps=0, correction_env_steps=PROBE)
+    cfg = dataclasses.replace(plan, correction=CORRECTION)
+
+    def make_env(robots, num_envs, task, seed, first=0):
+        return FallingToyEnv(num_envs, tuple(robots), seed)
+
+    with pytest.warns(EagleWarning, match="a correction needs a policy that walks"):
+        result = run_experiment(cfg, tmp_path / "run", make_env)
+    saved = load_correction(final_checkpoint(result.run_dir, "round1/correct_one"))
+    assert saved is not None
+    assert not saved.weights.any()
 
 
 def job(cfg: ExperimentCfg, stage, rank: int = 0) -> Job:
