@@ -59,9 +59,9 @@ class CorrectionRunner:
         self._make_env = make_env
         self._learner = ckpt.load_checkpoint(init, provenance.slot_table_hash).state
         self._actor = ckpt.load_actor(init, cfg.run.env_device)[0]
-        sim = cfg.task.sim
+        fine = cfg.evaluation  # footfalls ring on otherwise at other steps, and so does what answers them
         self._ev = EvaluationCfg(
-            num_steps=cfg.correction.num_steps, physics_dt=sim.physics_dt, decimation=sim.decimation
+            num_steps=cfg.correction.num_steps, physics_dt=fine.physics_dt, decimation=fine.decimation
         )
         self._units = torch.tensor(cfg.search.error_units, device=cfg.run.env_device)
         self._limits = torch.tensor(
@@ -135,7 +135,7 @@ class CorrectionRunner:
         return None
 
     def _env(self, num_envs: int) -> Any:
-        """Environments in the physics of training, undisturbed, in the same state every time."""
+        """Environments in the finer physics of evaluation, undisturbed, in the same state every time."""
         task = evaluation_task(self.cfg.task, self._ev)
         return self._make_env(self.cfg.robots, num_envs, task, self.stage.seed)
 
