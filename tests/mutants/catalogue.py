@@ -189,8 +189,8 @@ MUTANTS: tuple[Mutant, ...] = (
     ),
     Mutant(
         "eagle_rl/algorithms/specialists.py",
-        "enumerate(self.specialists)",
-        "enumerate(self.specialists[::-1])",
+        "zip(self.specialists, self.corrections",
+        "zip(self.specialists[::-1], self.corrections",
         LEARNER_TESTS,
     ),
     Mutant(LOSSES, "action / (teacher_std + 1 - mask)", "action * (teacher_std + 1 - mask)", LEARNER_TESTS),
