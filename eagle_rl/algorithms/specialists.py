@@ -49,8 +49,9 @@ class SpecialistBank:
             rows = (obs["robot"] == robot).nonzero(as_tuple=True)[0]
             inputs = (obs[group][rows] for group in ACTOR_INPUTS)
             latent, embedding[rows], _ = specialist.features(*inputs)
-            action[rows] = specialist.mlp(latent) * mask[rows]
-            if correction is not None:
+            if correction is None:
+                action[rows] = specialist.mlp(latent) * mask[rows]
+            else:
                 action[rows] = correction.act(specialist, obs[rows])
             std[rows] = specialist.distribution.std_param.clamp(*specialist.distribution.std_range) * mask[rows]
         return {"teacher_action": action, "teacher_std": std, "teacher_embedding": embedding}

@@ -48,7 +48,7 @@ class _Rollout:
 class CorrectionRunner:
     """Corrects the policy of a checkpoint, of whose learner nothing changes.
 
-    It takes a minute or two an iteration and starts anew if it is stopped.
+    It takes a few minutes an iteration and starts anew if it is stopped.
     """
 
     def __init__(

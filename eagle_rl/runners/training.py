@@ -196,6 +196,11 @@ def _copy_root(job: Job, checkpoints: Path) -> Path:
     if source.suffix == SUFFIX:
         raise CheckpointError(f"plan.root: {source}: a published policy has no critic to go on from; use a checkpoint.")
     manifest = verify_checkpoint(source)
+    if load_correction(source) is not None:
+        raise CheckpointError(
+            f"plan.root: {source}: a corrected specialist, which no training can go on from: its correction is no part "
+            "of its network. Use the stage before the correction, or a generalist distilled from it."
+        )
     if job.rank == 0:
         _tell_changed_meaning(source, manifest["config"], job.cfg)
     checkpoints.mkdir(parents=True, exist_ok=True)

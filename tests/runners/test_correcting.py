@@ -9,17 +9,16 @@ import pytest
 import torch
 
 from eagle_rl.config.schema import CorrectionCfg, ExperimentCfg
-from eagle_rl.errors import EagleWarning
+from eagle_rl.errors import CheckpointError, EagleWarning
 from eagle_rl.models.correction import CorrectedPolicy
 from eagle_rl.runners import correcting
 from eagle_rl.runners.checkpoint import load_actor, load_checkpoint, load_correction
 from eagle_rl.runners.plan import plan_stages
-from eagle_rl.runners.provenance import Provenance
 from eagle_rl.runners.records import final_checkpoint
 from eagle_rl.runners.stages import RunResult, run_experiment
-from eagle_rl.runners.training import Job, load_policy, train
+from eagle_rl.runners.training import load_policy, train
 from tests.runners.test_searching import StillToyEnv, make_still_env
-from tests.runners.toy_run import toy_experiment
+from tests.runners.toy_run import make_toy_env, refuse, toy_experiment, toy_job
 
 CORRECTION = CorrectionCfg(num_envs=64, num_steps=12, settling_steps=2, damping=0.5)
 PROBE = 3 * 64 * 12
@@ -64,7 +63,7 @@ def test_it_is_judged_and_teaches_with_its_correction(tmp_path):
     cfg, result = corrected(tmp_path)
     path = final_checkpoint(result.run_dir, "round1/correct_two")
     stage = next(stage for stage in plan_stages(cfg) if stage.name == "round1/correct_two")
-    assert isinstance(load_policy(job(cfg, stage), path), CorrectedPolicy)
+    assert isinstance(load_policy(toy_job(cfg, stage, tmp_path), path), CorrectedPolicy)
     distilled = load_checkpoint(final_checkpoint(result.run_dir, "round1/distill")).state
     assert "correction" not in distilled, "a generalist has learned what it says"
 
@@ -76,6 +75,14 @@ def test_a_correction_that_makes_nothing_better_is_dropped(tmp_path, monkeypatch
     saved = load_correction(path)
     assert saved is not None
     assert not saved.weights.any(), "coefficients of 3 throw any robot over"
+
+
+def test_nothing_is_trained_on_from_a_corrected_specialist(tmp_path):
+    """Its network alone acts otherwise than the policy it was judged as."""
+    _, result = corrected(tmp_path)
+    root = final_checkpoint(result.run_dir, "round1/correct_one")
+    with pytest.raises(CheckpointError, match="Use the stage before the correction"):
+        run_experiment(toy_experiment(method="ppo", root=str(root)), tmp_path / "on", make_toy_env)
 
 
 class FallingToyEnv(StillToyEnv):
@@ -100,27 +107,9 @@ def test_a_policy_that_cannot_walk_is_left_as_it_is_with_a_warning(tmp_path):
     assert not saved.weights.any()
 
 
-def job(cfg: ExperimentCfg, stage, rank: int = 0) -> Job:
-    return Job(
-        cfg=cfg,
-        stage=stage,
-        folder=Path("stage"),
-        init=None,
-        teachers=(),
-        start=None,
-        base=None,
-        make_env=refuse,
-        provenance=Provenance(),
-        check_claim=lambda: None,
-        rank=rank,
-    )
-
-
-def refuse(*args: object) -> None:
-    raise AssertionError("nobody builds environments here")
-
-
 def test_only_the_first_of_several_processes_corrects():
     cfg = toy_experiment(correction_env_steps=1)
     stage = next(stage for stage in plan_stages(cfg) if stage.kind == "correct")
-    assert train(job(cfg, stage, rank=1)) == Path("stage/checkpoints/model_1.pt"), "what the leader is going to write"
+    assert train(toy_job(cfg, stage, Path("stage"), refuse, rank=1)) == Path("stage/checkpoints/model_1.pt"), (
+        "what the leader is going to write"
+    )

@@ -16,11 +16,10 @@ from eagle_rl.evaluation.curves import read_curves
 from eagle_rl.evaluation.trials import PairedTrials
 from eagle_rl.runners.checkpoint import load_actor
 from eagle_rl.runners.plan import plan_stages
-from eagle_rl.runners.provenance import Provenance
 from eagle_rl.runners.records import final_checkpoint, stage_dir
 from eagle_rl.runners.stages import RunResult, run_experiment
-from eagle_rl.runners.training import Job, train
-from tests.runners.toy_run import JudgedToyEnv, make_toy_env, toy_experiment
+from eagle_rl.runners.training import train
+from tests.runners.toy_run import JudgedToyEnv, make_toy_env, refuse, toy_experiment, toy_job
 
 GENERATION = 2 * 4 * 5
 """Environment steps of a generation of the toy experiment."""
@@ -88,21 +87,5 @@ def test_a_search_logs_every_generation_and_its_checkpoints_start_other_stages(t
 def test_only_the_first_of_several_processes_searches(tmp_path):
     cfg = toy_experiment(search_env_steps=3 * GENERATION)
     stage = next(stage for stage in plan_stages(cfg) if stage.kind == "search")
-
-    def refuse(*args: object) -> None:
-        raise AssertionError("a follower builds no environments")
-
-    job = Job(
-        cfg=cfg,
-        stage=stage,
-        folder=tmp_path,
-        init=None,
-        teachers=(),
-        start=None,
-        base=None,
-        make_env=refuse,
-        provenance=Provenance(),
-        check_claim=lambda: None,
-        rank=1,
-    )
+    job = toy_job(cfg, stage, tmp_path, refuse, rank=1)
     assert train(job) == tmp_path / "checkpoints" / "model_3.pt", "what the leader is going to write"

@@ -14,11 +14,10 @@ from eagle_rl.evaluation.evaluate import EvaluationResult
 from eagle_rl.runners.checkpoint import load_actor, load_checkpoint
 from eagle_rl.runners.claims import Claim, ClaimLostError
 from eagle_rl.runners.plan import plan_stages
-from eagle_rl.runners.provenance import Provenance
 from eagle_rl.runners.records import final_checkpoint, read_record, stage_dir
 from eagle_rl.runners.stages import run_experiment
-from eagle_rl.runners.training import Job, train
-from tests.runners.toy_run import ENVS, STEPS, JudgedToyEnv, make_toy_env, parameters, toy_experiment
+from eagle_rl.runners.training import train
+from tests.runners.toy_run import ENVS, STEPS, JudgedToyEnv, make_toy_env, parameters, toy_experiment, toy_job
 
 
 @pytest.fixture(scope="module")
@@ -214,18 +213,7 @@ def test_who_reads_the_root_while_another_process_copies_it_reads_all_of_it(fini
     checkpoints.mkdir()
     theirs = checkpoints / root.name
     shutil.copyfile(root, theirs)
-    job = Job(
-        cfg=cfg,
-        stage=plan_stages(cfg)[0],
-        folder=tmp_path,
-        init=None,
-        teachers=(),
-        start=None,
-        base=None,
-        make_env=make_toy_env,
-        provenance=Provenance(),
-        check_claim=lambda: None,
-    )
+    job = toy_job(cfg, plan_stages(cfg)[0], tmp_path)
     with theirs.open("rb") as reader:
         inode = theirs.stat().st_ino
         with pytest.warns(EagleWarning, match="no such manifest"):  # which comes last

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -19,7 +20,11 @@ from eagle_rl.config.schema import (
     SearchCfg,
     TaskCfg,
 )
+from eagle_rl.evaluation.evaluate import MakeEnv
+from eagle_rl.runners.plan import Stage
+from eagle_rl.runners.provenance import Provenance
 from eagle_rl.runners.stages import RunResult
+from eagle_rl.runners.training import Job
 from tests.toy import FRAMES, ToyEnv
 
 ENVS, STEPS = 12, 4
@@ -72,6 +77,28 @@ def toy_experiment(iterations: int = 3, judge_envs: int = 4, **plan: object) -> 
         evaluation=EvaluationCfg(num_steps=5),
         run=RunCfg(save_interval=1, torch_threads=1),  # forked processes cannot use threads of their parent
     )
+
+
+def toy_job(cfg: ExperimentCfg, stage: Stage, folder: Path, make_env: MakeEnv = make_toy_env, rank: int = 0) -> Job:
+    """A stage without inputs, to be trained by itself."""
+    return Job(
+        cfg=cfg,
+        stage=stage,
+        folder=folder,
+        init=None,
+        teachers=(),
+        start=None,
+        base=None,
+        make_env=make_env,
+        provenance=Provenance(),
+        check_claim=lambda: None,
+        rank=rank,
+    )
+
+
+def refuse(*args: object) -> None:
+    """For who is to build no environments."""
+    raise AssertionError("nobody builds environments here")
 
 
 def parameters(result: RunResult) -> dict[str, Tensor]:
