@@ -30,7 +30,7 @@ class Policy:
     act: Callable[[TensorDict], Tensor]
     """Its mean actions: the actor's or, of a corrected specialist, those with their correction."""
     cfg: ExperimentCfg
-    """The experiment it was trained in, to be run on the device asked for."""
+    """The experiment it was trained in, to be run on the device asked for and on all cores of this machine."""
     sha256: str
     """Of its checkpoint."""
     env_steps: int | None
@@ -59,7 +59,8 @@ def load_policy(path: Path, device: str = "cpu") -> Policy:
     actor, manifest = load_actor(checkpoint, device, slot_table_hash(SLOT_NAMES))
     cfg = experiment_from_plain(manifest["config"], str(checkpoint))
     set_up_torch(1)  # a forward pass is little beside the physics, and waiting threads take the cores from it
-    cfg = dataclasses.replace(cfg, run=dataclasses.replace(cfg.run, device=device, env_device=device))
+    run = dataclasses.replace(cfg.run, device=device, env_device=device, num_threads=0)
+    cfg = dataclasses.replace(cfg, run=run)
     correction = load_correction(checkpoint, device)
     act = actor if correction is None else CorrectedPolicy(actor, correction)
     env_steps = manifest["env_steps"] if checkpoint.suffix == SUFFIX else training_steps(checkpoint)

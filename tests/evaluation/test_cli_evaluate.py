@@ -27,7 +27,8 @@ QUICK = ["--envs", "2", "--steps", "10"]
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """The smoke experiment's generalist on one robot."""
-    cfg = load_experiment("smoke", ["robots=[h1]", "plan.method=ppo", "plan.judge_envs_per_robot=0", "seed=7"])
+    overrides = ["robots=[h1]", "plan.method=ppo", "plan.judge_envs_per_robot=0", "seed=7", "run.num_threads=1"]
+    cfg = load_experiment("smoke", overrides)
     provenance = Provenance(slot_table_hash=slot_table_hash(SLOT_NAMES))
     return run_experiment(cfg, tmp_path_factory.mktemp("run"), make_env_factory(cfg.run), provenance=provenance)
 
@@ -68,6 +69,10 @@ def test_a_run_becomes_a_table_with_hash_protocol_and_seed(run, tmp_path, capsys
     assert result.checkpoint == run.records["generalist"].sha256
     assert (result.protocol.num_envs_per_robot, result.protocol.num_steps, result.seed) == (2, 10, 7)
     assert "| h1 | PPO |" in capsys.readouterr().out
+
+
+def test_a_policy_trained_on_one_core_is_judged_on_all_cores_of_this_machine(run):
+    assert load_policy(run.run_dir).cfg.run.num_threads == 0, "the run's number of threads is of where it was trained"
 
 
 def test_stored_results_are_tabled_without_simulating_again(run, tmp_path, capsys):
