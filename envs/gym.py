@@ -12,7 +12,7 @@ Observation, a dictionary of float32 arrays (columns, units and scales in ``envs
     =========== ======= ==================================================================================
     history     K * 102 the last K frames of proprioception, newest first
     command     5       v_x, v_y [m/s], omega [rad/s], height offset [m], pitch [rad], scaled
-    clock       2       sin(2 pi phase) of left and right foot
+    clock       2       sin(2 pi phase) of left and right foot (more with ``observations.clock_harmonics``)
     slot_mask   32      1 where the robot has a joint
     =========== ======= ==================================================================================
 

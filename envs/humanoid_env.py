@@ -20,12 +20,13 @@ from .mdp.active_commands import ActiveCommands
 from .mdp.aids import LearningAids, harness_damping, harness_wrench
 from .mdp.commands import CommandSampler
 from .mdp.curriculum import penalty_scale
-from .mdp.gait import advance_phase, clock, foot_phases
+from .mdp.gait import advance_phase, foot_phases
 from .mdp.layout import SENSED_SIZE
 from .mdp.metrics import contact_match, measured_commands, tracking_errors
 from .mdp.observations import (
     History,
     ObservationLayout,
+    clock_observation,
     command_observation,
     critic_observation,
     delay,
@@ -208,7 +209,7 @@ class HumanoidEnv(VecEnv):
         groups = {
             "history": self.history.flat,
             "command": command_observation(state, cfg),
-            "clock": clock(state.foot_phase),
+            "clock": clock_observation(state, cfg),
             "critic": critic_observation(self._last_frame, state, self.robots, self.embodiment, cfg, friction),
             "estimate": estimation_target(state, self.embodiment, cfg),
             "slot_mask": self.robots.slot_mask,

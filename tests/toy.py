@@ -29,7 +29,10 @@ START = 0.2
 class ToyEnv(VecEnv):
     """Pooled toy robots."""
 
-    def __init__(self, num_envs: int = 24, robots: tuple[str, ...] = tuple(ROBOTS), seed: int = 0) -> None:
+    def __init__(
+        self, num_envs: int = 24, robots: tuple[str, ...] = tuple(ROBOTS), seed: int = 0, waves: int = 0
+    ) -> None:
+        self.waves = torch.arange(1.0, waves + 1)
         self.num_envs, self.num_actions, self.device = num_envs, NUM_SLOTS, "cpu"
         self.max_episode_length, self.cfg, self.step_dt = EPISODE_LENGTH, {}, 0.02
         self.robot_names = list(robots)
@@ -46,7 +49,7 @@ class ToyEnv(VecEnv):
         self.frames = torch.zeros(num_envs, FRAMES, NUM_SLOTS)
         self._reset(torch.arange(num_envs))
         perm, sign = torch.tensor(MIRROR_PERMUTATION), torch.tensor(MIRROR_SIGN, dtype=torch.float32)
-        identity = {"command": 5, "clock": 2, "critic": NUM_SLOTS + 6, "estimate": 33}
+        identity = {"command": 5, "clock": 2 + waves, "critic": NUM_SLOTS + 6 + waves, "estimate": 33}
         self.mirror = {key: (torch.arange(n), torch.ones(n)) for key, n in identity.items()}
         self.mirror["actions"] = (perm, sign)
         self.mirror["history"] = (
@@ -57,14 +60,16 @@ class ToyEnv(VecEnv):
     def get_observations(self) -> TensorDict:
         current = self.frames[:, 0]
         speed = (current - self.frames[:, 1])[:, :3]
+        phase = 0.1 * self.episode_length_buf
+        waves = torch.sin(phase.unsqueeze(1) * self.waves)
         groups = {
             "history": self.frames.flatten(1).clone(),
             "command": self.command.clone(),
-            "clock": torch.zeros(self.num_envs, 2),
-            "critic": torch.cat([current, self.command, self.mass], dim=1),
+            "clock": torch.cat([torch.zeros(self.num_envs, 2), waves], dim=1),
+            "critic": torch.cat([current, self.command, self.mass, waves], dim=1),
             "estimate": torch.cat([speed, self.mass * torch.linspace(0.1, 1.0, 30)], dim=1),
             "slot_mask": self.mask.clone(),
-            "phase": 0.1 * self.episode_length_buf,
+            "phase": phase,
             "robot": self.robot.clone(),
         }
         return TensorDict(groups, batch_size=[self.num_envs])

@@ -64,6 +64,7 @@ def build_contract(cfg: ExperimentCfg, checkpoint: str, robots: Sequence[str]) -
         action_clip=task.control.action_clip,
         gait_phase_offset=task.gait.phase_offset,
         standing_phase=STANDING_PHASE,
+        clock_harmonics=task.observations.clock_harmonics,
         posture=_posture(task) if task.control.posture_reference else None,
         robots={spec.name: _robot(spec, cfg) for spec in map(load_robot, robots)},
     )

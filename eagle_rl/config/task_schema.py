@@ -184,6 +184,9 @@ class ObservationsCfg:
     """K, proprioceptive frames in s_t, newest first [-] (paper)."""
     last_action: bool = True
     """Whether the previous action is part of a frame (HugWBC 5; the paper does not name it)."""
+    clock_harmonics: int = 0
+    """Multiples of the gait's frequency that actor and critic see, sine and cosine each [-]; 0 is the sine of each
+    foot's phase alone (paper). A policy's root may have seen fewer: what is new begins with weights of zero."""
     embodiment_observation: bool = True
     """Off is the paper's "w/o EO": o_ea leaves critic, estimator and loss."""
     descriptor: Literal["paper", "extended"] = "paper"

@@ -85,6 +85,7 @@ CEILINGS: dict[str, float] = {
     "plan.specialist_num_envs": 1e6,
     "evaluation.num_steps": 1e6,
     "task.observations.history_length": 1e3,
+    "task.observations.clock_harmonics": 1e2,
     "task.terrain.num_levels": 1e3,
     "task.commands.curriculum.num_bins_lin_vel_x": 1e3,
     "task.commands.curriculum.num_bins_ang_vel_z": 1e3,

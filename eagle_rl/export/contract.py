@@ -6,7 +6,8 @@ Canonical angles are ``sign * (q - zero_offset)``; slot arrays hold zero where a
 2. ``history``: the last ``history_length`` frames, newest first; filled with the first frame at the start.
 3. ``command``: (v_x, v_y, omega, height offset, pitch) times its scale. ``clock``: sin(2 pi phase) of the left and
    the right foot; the right foot's phase starts at 0 and gains ``gait_frequency * step_dt`` a step, the left one is
-   ahead by ``gait_phase_offset``; both are ``standing_phase`` while the three velocity commands are zero.
+   ahead by ``gait_phase_offset``; both are ``standing_phase`` while the three velocity commands are zero. Where
+   ``clock_harmonics`` is not 0, cos(2 pi phase) of both feet follows, then sine and cosine of each multiple up to it.
 4. ``slot_mask``: 1 in the robot's slots.
 5. PD targets: resting pose + ``action_scale`` * action, both canonical; actions bounded by ``action_clip``. The
    resting pose is the default one or, where there is a ``posture``, that plus ``posture_offsets``, interpolated
@@ -23,7 +24,7 @@ from typing import Any
 
 from eagle_rl.errors import CheckpointError
 
-FORMAT = 4
+FORMAT = 5
 METADATA_KEY = "eagle.contract"
 """Entry of the ONNX file's metadata that holds the contract."""
 DIGEST_KEY = "eagle.contract.sha256"
@@ -102,6 +103,8 @@ class Contract:
     """[cycles]"""
     standing_phase: float
     """[cycles]"""
+    clock_harmonics: int
+    """Highest multiple of the gait's frequency in the clock; 0 for the sine alone."""
     posture: Posture | None
     """None where the resting pose is the default pose."""
     robots: dict[str, RobotContract]

@@ -157,7 +157,15 @@ class OnnxPolicy:
     def _clock(self, command: Array) -> Array:
         standing = not command[:3].any()
         phases = np.array([self._phase + self.contract.gait_phase_offset, self._phase])
-        return np.sin(2.0 * np.pi * (np.full(2, self.contract.standing_phase) if standing else phases))
+        return clock(np.full(2, self.contract.standing_phase) if standing else phases, self.contract.clock_harmonics)
+
+
+def clock(phases: Array, harmonics: int) -> Array:
+    """Gait clock of the feet's phases [cycles], shape (2,), see the contract; shape (2,) or (4 harmonics,)."""
+    if not harmonics:
+        return np.sin(2.0 * np.pi * phases)
+    angles = 2.0 * np.pi * np.arange(1, harmonics + 1)[:, None] * phases
+    return np.stack((np.sin(angles), np.cos(angles)), axis=1).ravel()
 
 
 def projected_gravity(quat: Array) -> Array:

@@ -19,8 +19,10 @@ NUM_SHIFTS = 3
 posture hardly moves it, since its resting pose is bent (docs/experiments.md, 22)."""
 SHIFT_UNIT = 5.0
 """Change of a scaled command by a coefficient of 1 [-]: one of an action and one of a command then weigh alike."""
+NUM_FEET = 2
+"""Leading columns of the clock: the sine of each foot's phase."""
 STANDING_CLOCK = 0.999
-"""Both feet's clocks are above this only where the robot stands, which is not corrected."""
+"""Both feet's sines are above this only where the robot stands, which is not corrected."""
 
 
 def waves(phase: Tensor, num_harmonics: int) -> Tensor:
@@ -66,7 +68,7 @@ class Correction:
             extra: added to the coefficients, the same shape.
         """
         history, command, clock = (obs[group] for group in ACTOR_INPUTS)
-        walks = clock.amin(dim=1, keepdim=True) < STANDING_CLOCK
+        walks = clock[:, :NUM_FEET].amin(dim=1, keepdim=True) < STANDING_CLOCK
         coefficients = (self.coefficients(command) + extra) * walks
         shift = torch.zeros_like(command)
         shift[:, :NUM_SHIFTS] = SHIFT_UNIT * coefficients[:, -NUM_SHIFTS:]

@@ -6,16 +6,12 @@ import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
-from rich.console import Console
 from rsl_rl.env import VecEnv
 
 from eagle_rl.algorithms.specialists import SpecialistBank
-from eagle_rl.config.load import experiment_from_plain
 from eagle_rl.config.schema import ExperimentCfg
-from eagle_rl.errors import CheckpointError
 from eagle_rl.evaluation.evaluate import MakeEnv, Policy
 from eagle_rl.models import EagleActor
 from eagle_rl.models.correction import CorrectedPolicy
@@ -26,16 +22,14 @@ from eagle_rl.runners.checkpoint import (
     load_correction,
     read_manifest,
     save_checkpoint,
-    verify_checkpoint,
 )
 from eagle_rl.runners.compass import DemonstrationEnv, ResidualBank, ResidualEnv, ResidualPolicy, begin_residual
 from eagle_rl.runners.correcting import CorrectionRunner
-from eagle_rl.runners.files import patiently, write_atomically
-from eagle_rl.runners.locate import find_checkpoint
+from eagle_rl.runners.files import patiently
 from eagle_rl.runners.on_policy import EagleRunner, make_train_cfg
 from eagle_rl.runners.plan import Stage, stage_num_envs, warm_task
-from eagle_rl.runners.provenance import Provenance, changes
-from eagle_rl.runners.published import SUFFIX
+from eagle_rl.runners.provenance import Provenance
+from eagle_rl.runners.root import take_root
 from eagle_rl.runners.searching import SearchRunner
 
 
@@ -81,7 +75,7 @@ def train(job: Job) -> Path:
     if latest is not None and read_manifest(latest)["stage_end"]:
         return latest
     if job.stage.kind == "root":
-        return _copy_root(job, checkpoints)
+        return take_root(job.cfg, checkpoints, job.provenance, first=job.rank == 0)
     if job.stage.kind == "search":
         return _search(job, latest)
     if job.stage.kind == "correct":
@@ -188,34 +182,3 @@ def load_policy(job: Job, checkpoint: Path) -> Policy:
         return ResidualPolicy(base, actor)
     correction = load_correction(checkpoint, device)
     return actor if correction is None else CorrectedPolicy(actor, correction)
-
-
-def _copy_root(job: Job, checkpoints: Path) -> Path:
-    """Take the experiment's root checkpoint into the run, so that the run is complete without it."""
-    source = find_checkpoint(Path(job.cfg.plan.root or ""))
-    if source.suffix == SUFFIX:
-        raise CheckpointError(f"plan.root: {source}: a published policy has no critic to go on from; use a checkpoint.")
-    manifest = verify_checkpoint(source)
-    if load_correction(source) is not None:
-        raise CheckpointError(
-            f"plan.root: {source}: a corrected specialist, which no training can go on from: its correction is no part "
-            "of its network. Use the stage before the correction, or a generalist distilled from it."
-        )
-    if job.rank == 0:
-        _tell_changed_meaning(source, manifest["config"], job.cfg)
-    checkpoints.mkdir(parents=True, exist_ok=True)
-    for suffix in (".pt", ".json"):  # the manifest last: what has one is complete; whole, for all processes copy it
-        path = source.with_suffix(suffix)
-        write_atomically(checkpoints / path.name, path.read_bytes())
-    return checkpoints / source.name
-
-
-def _tell_changed_meaning(root: Path, saved: dict[str, Any], cfg: ExperimentCfg) -> None:
-    """Say what makes a root's observations and actions mean something else here; the weights would fit all the same."""
-    was = experiment_from_plain(saved, str(root)).task
-    parts = ("control", "observations", "gait")
-    lines = [line for p in parts for line in changes(p, *(dataclasses.asdict(getattr(t, p)) for t in (was, cfg.task)))]
-    if lines:
-        listed = "\n  ".join(f"task.{line}" for line in lines)
-        text = f"warning: plan.root {root} was trained with other values, it acts differently here:\n  {listed}"
-        Console(stderr=True).print(text, highlight=False, markup=False, soft_wrap=True)

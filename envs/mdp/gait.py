@@ -100,3 +100,18 @@ def swing_target(foot_phase: Tensor, swing_height: Tensor, cfg: GaitCfg) -> Tens
 def clock(foot_phase: Tensor) -> Tensor:
     """Clock observation ``sin(2 pi phi)`` of (left, right), shape (N, 2) (paper, Eq. clock)."""
     return torch.sin(2.0 * math.pi * foot_phase)
+
+
+def clock_harmonics(foot_phase: Tensor, count: int) -> Tensor:
+    """What the sine of :func:`clock` does not tell: cos(2 pi phi), sin(4 pi phi), cos(4 pi phi), sin(6 pi phi), ...
+
+    Args:
+        foot_phase: (left, right) [cycles], shape (N, 2).
+        count: highest multiple of the gait's frequency, at least 1.
+
+    Returns:
+        Left and right side by side for each wave, shape (N, 4 count - 2).
+    """
+    multiples = torch.arange(1, count + 1, dtype=foot_phase.dtype, device=foot_phase.device)
+    angle = 2.0 * math.pi * multiples[:, None] * foot_phase.unsqueeze(1)
+    return torch.stack((torch.sin(angle), torch.cos(angle)), dim=2).flatten(1)[:, 2:]

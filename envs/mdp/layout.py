@@ -134,11 +134,20 @@ def _embodiment_terms(cfg: ObservationsCfg) -> tuple[ObservationTerm, ...]:
     return (ObservationTerm("embodiment", "standardised", 1.0, EMBODIMENT[cfg.descriptor]),)
 
 
+def _wave_terms(cfg: ObservationsCfg) -> tuple[ObservationTerm, ...]:
+    """Last in their groups, so that a network that has not seen them grows at its end."""
+    if not cfg.clock_harmonics:
+        return ()
+    mirror = Mirror.stack([FEET] * (2 * cfg.clock_harmonics - 1))
+    return (ObservationTerm("clock_harmonics", "-", 1.0, mirror),)
+
+
 def _tables(cfg: ObservationsCfg) -> dict[str, tuple[ObservationTerm, ...]]:
     scales = cfg.scales
     frame = _frame_terms(cfg)
     command = ObservationTerm("command", "m/s m/s rad/s m rad", scales.command, COMMAND)
     clock = ObservationTerm("clock", "-", 1.0, FEET)
+    waves = _wave_terms(cfg)
     base_lin_vel = ObservationTerm("base_lin_vel", "m/s", scales.base_lin_vel, POLAR)
     privileged = (
         ObservationTerm("height_error", "m", scales.height_error, Mirror.keep(1.0)),
@@ -151,8 +160,8 @@ def _tables(cfg: ObservationsCfg) -> dict[str, tuple[ObservationTerm, ...]]:
     return {
         "history": frame * cfg.history_length,
         "command": (command,),
-        "clock": (clock,),
-        "critic": (*frame, command, clock, base_lin_vel, *privileged, *_embodiment_terms(cfg)),
+        "clock": (clock, *waves),
+        "critic": (*frame, command, clock, base_lin_vel, *privileged, *_embodiment_terms(cfg), *waves),
         "estimate": (base_lin_vel, *_embodiment_terms(cfg)),
         "actions": (ObservationTerm("actions", "-", 1.0, SLOTS),),
     }

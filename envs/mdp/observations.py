@@ -12,12 +12,13 @@ from eagle_rl.config.schema import ObservationsCfg, Range
 
 from ..geometry import into_yaw_frame
 from ..state import PooledRobots, PooledState
-from .gait import clock
+from .gait import clock, clock_harmonics
 from .layout import REFERENCE_MASS, SENSED_SIZE, ObservationLayout, scale_vector, scan_points
 
 __all__ = [
     "History",
     "ObservationLayout",
+    "clock_observation",
     "command_observation",
     "critic_observation",
     "delay",
@@ -107,6 +108,14 @@ def command_observation(state: PooledState, cfg: ObservationsCfg) -> Tensor:
     return _scaled([state.command], cfg, "command")
 
 
+def clock_observation(state: PooledState, cfg: ObservationsCfg) -> Tensor:
+    """Gait clock, shape (N, 2), or with harmonics (N, 4 ``clock_harmonics``)."""
+    sines = clock(state.foot_phase)
+    if not cfg.clock_harmonics:
+        return sines
+    return torch.cat((sines, clock_harmonics(state.foot_phase, cfg.clock_harmonics)), dim=1)
+
+
 def _friction_column(friction: Tensor, friction_range: Range) -> Tensor:
     """Friction mapped from its range to [-1, 1], shape (N, 1); zero where the range is one number."""
     low, high = friction_range
@@ -153,6 +162,8 @@ def critic_observation(
     """
     columns = [state.command, clock(state.foot_phase), *_privileged_columns(state, robots, friction_range)]
     columns = columns if embodiment is None else [*columns, embodiment]
+    if cfg.clock_harmonics:
+        columns.append(clock_harmonics(state.foot_phase, cfg.clock_harmonics))
     return torch.cat((frame, _scaled(columns, cfg, "critic", first=frame.shape[1])), dim=1)
 
 

@@ -31,10 +31,11 @@ def others(env: HumanoidEnv, row: int) -> Tensor:
     return torch.tensor([i for i in range(env.num_envs) if i != row])
 
 
-@pytest.mark.parametrize("embodiment", [True, False])
+@pytest.mark.parametrize(("embodiment", "harmonics"), [(True, 0), (False, 0), (True, 3)])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_observations_have_the_announced_shapes(embodiment: bool, dtype: torch.dtype) -> None:
-    task = replace(TaskCfg(), observations=ObservationsCfg(embodiment_observation=embodiment))
+def test_observations_have_the_announced_shapes(embodiment: bool, harmonics: int, dtype: torch.dtype) -> None:
+    observed = ObservationsCfg(embodiment_observation=embodiment, clock_harmonics=harmonics)
+    task = replace(TaskCfg(), observations=observed)
     env = make_env(num_envs=5, task=task, dtype=dtype)
     assert env.robots.robot_id.tolist() == [0, 0, 0, 1, 1]
     observations, rewards, dones, extras = env.step(actions(5, 0))
@@ -43,7 +44,7 @@ def test_observations_have_the_announced_shapes(embodiment: bool, dtype: torch.d
         assert shapes == {
             "history": (5, 510),
             "command": (5, 5),
-            "clock": (5, 2),
+            "clock": (5, 12 if harmonics else 2),
             "critic": (5, env.layout.size("critic")),
             "estimate": (5, 33 if embodiment else 3),
             "slot_mask": (5, 32),

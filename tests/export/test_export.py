@@ -37,12 +37,19 @@ CFG = ExperimentCfg(
 SCRIPT = parse_commands("- {t: 0}\n- {t: 1, vx: 0.5, wz: 0.3}\n- {t: 2, h: -0.2, p: 0.3, vy: -0.2}")
 
 
+HARMONICS = dataclasses.replace(CFG.task.observations, clock_harmonics=3)
+WITH_HARMONICS = dataclasses.replace(CFG, task=dataclasses.replace(CFG.task, observations=HARMONICS))
+
+
+def export_untrained(cfg, folder):
+    actor = untrained_actor(cfg)
+    export_onnx(actor, build_contract(cfg, "0" * 64, ROBOTS), folder / "policy.onnx")
+    return actor, folder / "policy.onnx"
+
+
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory):
-    path = tmp_path_factory.mktemp("export") / "policy.onnx"
-    actor = untrained_actor(CFG)
-    export_onnx(actor, build_contract(CFG, "0" * 64, ROBOTS), path)
-    return actor, path
+    return export_untrained(CFG, tmp_path_factory.mktemp("export"))
 
 
 def test_onnx_and_torch_agree_for_one_and_for_many(exported):
@@ -57,12 +64,12 @@ def test_a_network_that_computes_something_else_is_not_written(exported, tmp_pat
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
-def test_the_runtime_chooses_the_env_s_first_200_actions_from_the_contract_alone(exported, robot):
-    actor, path = exported
+@pytest.mark.parametrize(("robot", "cfg"), [("h1", CFG), ("n1", CFG), ("h1", WITH_HARMONICS)])
+def test_the_runtime_chooses_the_env_s_first_200_actions_from_the_contract_alone(tmp_path, robot, cfg):
+    actor, path = export_untrained(cfg, tmp_path)
     policy = OnnxPolicy(path, robot)
-    protocol = dataclasses.replace(CFG.evaluation, num_steps=200, noise=False)
-    env = HumanoidEnv(evaluation_task(CFG.task, protocol), [load_robot(robot)], 1, seed=1, num_threads=1)
+    protocol = dataclasses.replace(cfg.evaluation, num_steps=200, noise=False)
+    env = HumanoidEnv(evaluation_task(cfg.task, protocol), [load_robot(robot)], 1, seed=1, num_threads=1)
     batch = env.pool.batches[0]
     for step in range(200):
         command = SCRIPT.at(step * env.step_dt)

@@ -25,6 +25,7 @@ from eagle_rl.models.correction import (
     waves,
 )
 from tests.learner.helpers import make_runner
+from tests.toy import ToyEnv
 
 SLOTS = torch.tensor([0, 2, 5])
 PARTNER, JOINT_SIGN = torch.tensor([1, 0, 2]), torch.tensor([-1.0, -1.0, 1.0])
@@ -49,9 +50,9 @@ def even_correction() -> Correction:
     return dataclasses.replace(correction(), middle=torch.zeros(5))
 
 
-def toy() -> tuple:
+def toy(waves: int = 0) -> tuple:
     """A policy and what it sees, walking; the phases are of a quarter cycle and more."""
-    runner = make_runner()
+    runner = make_runner(env=ToyEnv(waves=waves))
     obs = runner.env.get_observations()
     return runner.alg.actor, obs.update({"phase": torch.linspace(0.25, 0.9, len(obs))})
 
@@ -106,6 +107,13 @@ def test_a_policy_is_told_more_of_a_velocity_in_shift_units():
 def test_a_standing_robot_is_not_corrected():
     actor, obs = toy()
     obs["clock"] = torch.ones_like(obs["clock"])
+    some = correction(normal(21, WIDTH))
+    torch.testing.assert_close(some.act(actor, obs), actor(obs))
+
+
+def test_a_standing_robot_is_known_by_the_sines_of_its_feet_whatever_the_harmonics():
+    actor, obs = toy(waves=10)
+    obs["clock"][:, :2], obs["clock"][:, 2:] = 1.0, -1.0
     torch.testing.assert_close(correction(normal(21, WIDTH)).act(actor, obs), actor(obs))
 
 

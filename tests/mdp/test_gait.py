@@ -6,7 +6,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from eagle_rl.config.schema import GaitCfg
-from envs.mdp.gait import advance_phase, clock, contact_probability, foot_phases, homogenise, swing_target
+from envs.mdp.gait import (
+    advance_phase,
+    clock,
+    clock_harmonics,
+    contact_probability,
+    foot_phases,
+    homogenise,
+    swing_target,
+)
 
 CFG = GaitCfg()
 CONTACT_TABLE = {
@@ -80,6 +88,22 @@ def test_standing_robots_keep_both_feet_in_the_middle_of_stance() -> None:
     assert standing.tolist() == [[0.25, 0.25]]
     assert contact_probability(standing, CFG).tolist() == [pytest.approx([1.0, 1.0], abs=1e-6)]
     assert clock(standing).tolist() == [pytest.approx([1.0, 1.0])]
+
+
+def test_harmonics_go_on_from_the_sine_the_clock_has_to_the_cosine_and_its_multiples() -> None:
+    eighth, quarter, root_half = 0.125, 0.25, 0.5**0.5
+    seen = clock_harmonics(phases(eighth, quarter), 2)[0].tolist()
+    assert seen == [pytest.approx(x) for x in (root_half, 0.0, 1.0, 0.0, 0.0, -1.0)]  # left, right: cos, sin 2, cos 2
+
+
+@given(st.floats(0.0, 0.999), st.integers(1, 6))
+def test_clock_and_harmonics_together_are_the_powers_of_one_turning_hand(phase: float, count: int) -> None:
+    feet = phases(phase, (phase + 0.5) % 1.0)
+    pairs = torch.cat((clock(feet), clock_harmonics(feet, count)), dim=1).reshape(count, 2, 2)
+    hand = torch.complex(pairs[0, 1], pairs[0, 0])
+    for k in range(count):
+        power = hand ** (k + 1)
+        torch.testing.assert_close(torch.complex(pairs[k, 1], pairs[k, 0]), power, rtol=0, atol=1e-9)
 
 
 def test_swing_target_is_the_quintic() -> None:

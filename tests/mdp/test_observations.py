@@ -11,10 +11,11 @@ from torch import Tensor
 
 from eagle_rl.config.schema import ObservationsCfg
 from eagle_rl.errors import ConfigError
-from envs.mdp.gait import clock
+from eagle_rl.runners.root import clock_columns
 from envs.mdp.layout import EMBODIMENT, ObservationLayout, scan_points
 from envs.mdp.observations import (
     History,
+    clock_observation,
     command_observation,
     critic_observation,
     delay,
@@ -54,7 +55,7 @@ def groups(state: PooledState, robots: PooledRobots, o_ea: Tensor, cfg: Observat
     return {
         "history": proprioception(state, robots, cfg).repeat(1, cfg.history_length),
         "command": command_observation(state, cfg),
-        "clock": clock(state.foot_phase),
+        "clock": clock_observation(state, cfg),
         "critic": critic_of(state, robots, o_ea, cfg),
         "estimate": estimation_target(state, o_ea, cfg),
         "actions": state.actions,
@@ -80,6 +81,20 @@ def test_without_embodiment_and_last_action_the_groups_shrink() -> None:
     assert estimation_target(state, None, cfg).shape[1] == layout.size("estimate") == 3
     critic = critic_of(state, ROBOTS, None, cfg)
     assert critic.shape[1] == layout.size("critic") == LAYOUT.size("critic") - 32 - EMBODIMENT_DIM
+
+
+@pytest.mark.parametrize("embodied", [True, False])
+def test_harmonics_of_the_clock_come_last_so_that_networks_without_them_grow_at_their_end(embodied: bool) -> None:
+    more = replace(CFG, clock_harmonics=3, embodiment_observation=embodied)
+    fewer = replace(more, clock_harmonics=0)
+    state, o_ea = random_state(0, ROBOTS), embodiment() if embodied else None
+    seen, before = clock_observation(state, more), clock_observation(state, fewer)
+    assert seen.shape[1] == ObservationLayout(more).size("clock") == clock_columns(more) == 12
+    assert before.shape[1] == ObservationLayout(fewer).size("clock") == clock_columns(fewer) == 2
+    critic, critic_before = critic_of(state, ROBOTS, o_ea, more), critic_of(state, ROBOTS, o_ea, fewer)
+    assert critic.shape[1] == ObservationLayout(more).size("critic")
+    assert torch.equal(seen[:, :2], before)
+    assert torch.equal(critic, torch.cat((critic_before, seen[:, 2:]), dim=1))
 
 
 CRITIC_SOURCES = {
@@ -143,15 +158,16 @@ def test_observations_are_bounded() -> None:
 
 
 @settings(max_examples=10, deadline=None)
-@given(st.integers(0, 10_000))
-def test_mirroring_the_robot_mirrors_every_observation(seed: int) -> None:
+@given(st.integers(0, 10_000), st.integers(0, 3))
+def test_mirroring_the_robot_mirrors_every_observation(seed: int, clock_harmonics: int) -> None:
+    cfg = replace(CFG, clock_harmonics=clock_harmonics)
     robots = random_robots(seed, symmetric=True)
     state, o_ea = random_state(seed, robots), embodiment(seed)
-    mirror = LAYOUT.mirror()
+    mirror = ObservationLayout(cfg).mirror()
     perm, sign = mirror["estimate"]
     o_ea_mirrored = (torch.cat((state.base_lin_vel_b, o_ea), dim=1)[:, perm] * sign)[:, 3:]
-    seen = groups(state, robots, o_ea)
-    reflected = groups(mirror_state(state, CFG), robots, o_ea_mirrored)
+    seen = groups(state, robots, o_ea, cfg)
+    reflected = groups(mirror_state(state, cfg), robots, o_ea_mirrored, cfg)
     for name, value in seen.items():
         perm, sign = mirror[name]
         assert torch.allclose(value[:, perm] * sign, reflected[name], rtol=0, atol=1e-9), name

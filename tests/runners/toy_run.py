@@ -23,6 +23,7 @@ from eagle_rl.config.schema import (
 from eagle_rl.evaluation.evaluate import MakeEnv
 from eagle_rl.runners.plan import Stage
 from eagle_rl.runners.provenance import Provenance
+from eagle_rl.runners.root import clock_columns
 from eagle_rl.runners.stages import RunResult
 from eagle_rl.runners.training import Job
 from tests.toy import FRAMES, ToyEnv
@@ -57,7 +58,7 @@ class JudgedToyEnv(ToyEnv):
 
 
 def make_toy_env(robots: Sequence[str], num_envs: int, task: TaskCfg, seed: int, first: int = 0) -> JudgedToyEnv:
-    return JudgedToyEnv(num_envs, tuple(robots), seed)
+    return JudgedToyEnv(num_envs, tuple(robots), seed, waves=clock_columns(task.observations) - 2)
 
 
 def toy_experiment(iterations: int = 3, judge_envs: int = 4, **plan: object) -> ExperimentCfg:

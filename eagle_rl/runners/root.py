@@ -1,0 +1,114 @@
+"""The checkpoint an experiment starts from, taken into its run."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.console import Console
+from torch import Tensor
+from torch.nn.functional import pad
+
+from eagle_rl.config.load import experiment_from_plain
+from eagle_rl.config.schema import ExperimentCfg, ObservationsCfg, TaskCfg
+from eagle_rl.errors import CheckpointError
+from eagle_rl.runners.checkpoint import load_checkpoint, load_correction, save_checkpoint, verify_checkpoint
+from eagle_rl.runners.files import write_atomically
+from eagle_rl.runners.locate import find_checkpoint
+from eagle_rl.runners.provenance import Provenance, changes
+from eagle_rl.runners.published import SUFFIX
+
+_FIRST_LAYER = "mlp.0.weight"
+
+
+def take_root(cfg: ExperimentCfg, checkpoints: Path, provenance: Provenance, first: bool = True) -> Path:
+    """Put ``plan.root`` into a run, so that the run is complete without it; its checkpoint there.
+
+    A root that saw fewer harmonics of the clock gets inputs for them, with weights of zero: it acts as it did.
+
+    Args:
+        cfg: the experiment.
+        checkpoints: folder of the run's root stage.
+        provenance: of that stage, for a root that is not taken over as it is.
+        first: whether this is the first of several data-parallel processes; the others leave reports to it.
+
+    Raises:
+        CheckpointError: no training can go on from it.
+    """
+    source = find_checkpoint(Path(cfg.plan.root or ""))
+    if source.suffix == SUFFIX:
+        raise CheckpointError(f"plan.root: {source}: a published policy has no critic to go on from; use a checkpoint.")
+    manifest = verify_checkpoint(source)
+    if load_correction(source) is not None:
+        raise CheckpointError(
+            f"plan.root: {source}: a corrected specialist, which no training can go on from: its correction is no part "
+            "of its network. Use the stage before the correction, or a generalist distilled from it."
+        )
+    was = experiment_from_plain(manifest["config"], str(source)).task
+    if first:
+        _tell_changed_meaning(source, was, cfg.task)
+    new = clock_columns(cfg.task.observations) - clock_columns(was.observations)
+    if new > 0:
+        about = {name: manifest[name] for name in ("iteration", "env_steps", "score")}
+        if first:
+            state = widen_clock(load_checkpoint(source).state, new)
+            save_checkpoint(checkpoints, state, provenance, stage_end=True, **about)
+        return checkpoints / f"model_{about['iteration']}.pt"
+    checkpoints.mkdir(parents=True, exist_ok=True)
+    for suffix in (".pt", ".json"):  # the manifest last: what has one is complete; whole, for all processes copy it
+        path = source.with_suffix(suffix)
+        write_atomically(checkpoints / path.name, path.read_bytes())
+    return checkpoints / source.name
+
+
+def clock_columns(cfg: ObservationsCfg) -> int:
+    """Columns of the clock an actor sees: the sine of each foot, or sine and cosine of every harmonic of each."""
+    return 4 * cfg.clock_harmonics or 2
+
+
+def widen_clock(state: dict[str, Any], columns: int) -> dict[str, Any]:
+    """A learner's state with that many more columns of clock, last in what actor and critic read, weights zero.
+
+    The optimiser knows its parameters, the actor's and then the critic's, by number. Of new weights it expects
+    gradients as large as of the old ones beside them: with second moments of zero its first steps would be three times
+    as long.
+    """
+    learner, optimizer = state["algorithm"], state["algorithm"]["optimizer_state_dict"]
+    networks = {name: learner[f"{name}_state_dict"] for name in ("actor", "critic")}
+    parameters = [f"{name}.{parameter}" for name, network in networks.items() for parameter in network]
+
+    def zeros(weights: Tensor) -> Tensor:
+        return pad(weights, (0, columns))
+
+    moments = dict(optimizer["state"])
+    for name in networks:
+        at = parameters.index(f"{name}.{_FIRST_LAYER}")
+        squares = moments[at]["exp_avg_sq"]
+        new = squares.mean(dim=1, keepdim=True).expand(-1, columns)
+        wider = {"exp_avg": zeros(moments[at]["exp_avg"]), "exp_avg_sq": torch.cat((squares, new), dim=1)}
+        moments[at] = moments[at] | wider
+    widened = {
+        f"{name}_state_dict": network | {_FIRST_LAYER: zeros(network[_FIRST_LAYER])}
+        for name, network in networks.items()
+    }
+    sizes = state["architecture"]["observations"]
+    return state | {
+        "architecture": state["architecture"] | {"observations": sizes | {"clock": sizes["clock"] + columns}},
+        "algorithm": learner | widened | {"optimizer_state_dict": optimizer | {"state": moments}},
+    }
+
+
+def _tell_changed_meaning(root: Path, was: TaskCfg, task: TaskCfg) -> None:
+    """Say what makes a root's observations and actions mean something else here; the weights would fit all the same."""
+    seen = dataclasses.replace(was.observations, clock_harmonics=task.observations.clock_harmonics)
+    before, now = (
+        {part: dataclasses.asdict(getattr(t, part)) for part in ("control", "observations", "gait")}
+        for t in (dataclasses.replace(was, observations=seen), task)
+    )
+    lines = changes("task", before, now)
+    if lines:
+        listed = "\n  ".join(lines)
+        text = f"warning: plan.root {root} was trained with other values, it acts differently here:\n  {listed}"
+        Console(stderr=True).print(text, highlight=False, markup=False, soft_wrap=True)
