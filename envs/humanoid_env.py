@@ -92,10 +92,9 @@ class HumanoidEnv(VecEnv):
             first_env: number each robot's first environment goes by in the random streams, so that a large pool can be
                 simulated in parts that draw what the whole would.
         """
-        self.task = task
+        self.task, self.cfg = task, asdict(task)
         self.num_envs = num_envs
         self.device = torch.device(device)
-        self.cfg = asdict(task)
         self.step_dt = task.sim.physics_dt * task.sim.decimation
         self.max_episode_length = round(task.terminations.episode_length_s / self.step_dt)
         self.robot_names = [spec.name for spec in robots]
