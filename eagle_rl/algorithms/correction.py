@@ -15,7 +15,7 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
-from eagle_rl.models.correction import NUM_HARMONICS, NUM_SHIFTS, Correction, monomials, waves
+from eagle_rl.models.correction import NUM_HARMONICS, NUM_SHIFTS, Correction, half_a_cycle, monomials, waves
 
 ERROR_HARMONICS = 10
 """Harmonics of an error that are looked at."""
@@ -57,9 +57,9 @@ class Mirror:
     def both(self, probe: Probe) -> Probe:
         """A probe and its mirror image, rows of one after the other."""
         perm, sign = self.command
-        turned = sign.unsqueeze(1) * _half_a_cycle(ERROR_HARMONICS).to(sign)
+        turned = sign.unsqueeze(1) * half_a_cycle(ERROR_HARMONICS).to(sign)
         joints = probe.change[:, :-NUM_SHIFTS].unflatten(1, (len(self.partner), -1))
-        joints = joints[:, self.partner] * self.sign.unsqueeze(1) * _half_a_cycle(NUM_HARMONICS).to(sign)
+        joints = joints[:, self.partner] * self.sign.unsqueeze(1) * half_a_cycle(NUM_HARMONICS).to(sign)
         shifts = probe.change[:, -NUM_SHIFTS:] * sign[:NUM_SHIFTS]
         image = Probe(
             command=probe.command[:, perm] * sign,
@@ -68,11 +68,6 @@ class Mirror:
             error=probe.error[:, perm] * turned,
         )
         return Probe(*(torch.cat([getattr(x, field.name) for x in (probe, image)]) for field in fields(probe)))
-
-
-def _half_a_cycle(num_harmonics: int) -> Tensor:
-    """What half a cycle does to the coefficients of :func:`waves`, shape (2 num_harmonics + 1,)."""
-    return (-1.0) ** torch.tensor([0, *(k for k in range(1, num_harmonics + 1) for _ in range(2))])
 
 
 def error_waves(errors: Tensor, phases: Tensor) -> Tensor:

@@ -194,6 +194,8 @@ class CorrectionCfg:
     """Control steps of a rollout, from rest."""
     settling_steps: int = 60
     """The first of them, which are not looked at."""
+    gain_std: float = 0.03
+    """Of the changes tried of every gain by which a joint answers the yaw rate's error [s/rad]; 0 tunes none."""
     std: float = 0.03
     """Of the changes tried, in units of action, for every joint and harmonic [-]."""
     damping: float = 6.0

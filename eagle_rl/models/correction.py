@@ -1,4 +1,7 @@
-"""A policy with a correction: something added to its command and its action that depends on command and phase alone."""
+"""A policy with a correction: what is added to its command and its action.
+
+A part of it depends on command and phase alone; a smaller one answers the error of the yaw rate.
+"""
 
 from __future__ import annotations
 
@@ -25,6 +28,17 @@ STANDING_CLOCK = 0.999
 """Both feet's sines are above this only where the robot stands, which is not corrected."""
 
 
+FEEDBACK_HARMONICS = 1
+"""Of the gait, by which a gain may vary: a foot in stance can turn the pelvis, one in swing cannot."""
+YAW = 2
+"""Column of the yaw rate in the newest frame, and of its command."""
+
+
+def half_a_cycle(num_harmonics: int) -> Tensor:
+    """What half a cycle does to the coefficients of :func:`waves`, shape (2 num_harmonics + 1,)."""
+    return (-1.0) ** torch.tensor([0, *(k for k in range(1, num_harmonics + 1) for _ in range(2))])
+
+
 def waves(phase: Tensor, num_harmonics: int) -> Tensor:
     """1, cos 2 pi phi, sin 2 pi phi, cos 4 pi phi, ... of phases (...) [cycles], shape (..., 2 num_harmonics + 1)."""
     angle = 2.0 * math.pi * phase.unsqueeze(-1) * torch.arange(1, num_harmonics + 1, device=phase.device)
@@ -40,7 +54,7 @@ def monomials(x: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Correction:
-    """Coefficients of :func:`waves` for every joint, and of the commands, as polynomials of the command."""
+    """Coefficients of :func:`waves` for every joint, and of the commands, as polynomials of the command; gains."""
 
     weights: Tensor
     """Shape (21, S (2 NUM_HARMONICS + 1) + NUM_SHIFTS)."""
@@ -50,6 +64,10 @@ class Correction:
     """Of the scaled commands' ranges, shape (5,)."""
     half_range: Tensor
     """Half the width of those, shape (5,)."""
+    gains: Tensor
+    """Action per error of the yaw rate [s/rad], times :func:`waves`, shape (S, 2 FEEDBACK_HARMONICS + 1)."""
+    yaw_scales: Tensor
+    """Of the yaw rate and of its command in the observations, shape (2,)."""
 
     def normalised(self, command: Tensor) -> Tensor:
         """Scaled commands (N, 5) as shares of their ranges, in [-1, 1]; beyond these a polynomial would run away."""
@@ -59,13 +77,20 @@ class Correction:
         """Of scaled commands (N, 5), shape (N, S (2 NUM_HARMONICS + 1) + NUM_SHIFTS)."""
         return monomials(self.normalised(command)) @ self.weights
 
-    def act(self, actor: EagleActor, obs: TensorDict, extra: Tensor | float = 0.0) -> Tensor:
+    def yaw_error(self, history: Tensor, command: Tensor) -> Tensor:
+        """How much faster the robot turns than it is told to, as its gyroscope says [rad/s], shape (N,)."""
+        return history[:, YAW] / self.yaw_scales[0] - command[:, YAW] / self.yaw_scales[1]
+
+    def act(
+        self, actor: EagleActor, obs: TensorDict, extra: Tensor | float = 0.0, extra_gains: Tensor | float = 0.0
+    ) -> Tensor:
         """Mean actions (N, 32) of the corrected policy.
 
         Args:
             actor: the policy.
             obs: the groups it reads, ``slot_mask`` and ``phase``.
             extra: added to the coefficients, the same shape.
+            extra_gains: added to the gains, shape (N, S, 2 FEEDBACK_HARMONICS + 1).
         """
         history, command, clock = (obs[group] for group in ACTOR_INPUTS)
         walks = clock[:, :NUM_FEET].amin(dim=1, keepdim=True) < STANDING_CLOCK
@@ -74,7 +99,10 @@ class Correction:
         shift[:, :NUM_SHIFTS] = SHIFT_UNIT * coefficients[:, -NUM_SHIFTS:]
         actions = actor.mean_actions(history, command + shift, clock, obs["slot_mask"])
         by_joint = coefficients[:, :-NUM_SHIFTS].unflatten(1, (len(self.slots), -1))
-        more = (by_joint * waves(obs["phase"], NUM_HARMONICS).unsqueeze(1)).sum(dim=2)
+        waving = waves(obs["phase"], NUM_HARMONICS).unsqueeze(1)
+        more = (by_joint * waving).sum(dim=2)
+        gains = ((self.gains + extra_gains) * waving[..., : self.gains.shape[1]]).sum(dim=2)
+        more += gains * self.yaw_error(history, command).unsqueeze(1) * walks
         return actions.index_add(1, self.slots, more)
 
     def state_dict(self) -> dict[str, Tensor]:

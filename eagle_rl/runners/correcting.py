@@ -1,7 +1,8 @@
-"""The stage that takes off what of a policy's errors repeats with the gait, on its one robot."""
+"""The stage that answers the yaw rate's error and takes off what of all errors repeats with the gait, on one robot."""
 
 from __future__ import annotations
 
+import math
 import time
 import warnings
 from collections.abc import Callable
@@ -14,21 +15,28 @@ from rich.console import Console
 from torch import Tensor
 
 from eagle_rl.algorithms.correction import Mirror, Probe, error_waves, improve
+from eagle_rl.algorithms.feedback import descent, symmetric
 from eagle_rl.config.schema import EvaluationCfg, ExperimentCfg
 from eagle_rl.errors import EagleWarning
 from eagle_rl.evaluation.evaluate import MakeEnv
 from eagle_rl.evaluation.protocol import COMMANDS, draw_commands, evaluation_task
-from eagle_rl.models.correction import NUM_HARMONICS, NUM_SHIFTS, Correction, monomials
+from eagle_rl.models.correction import FEEDBACK_HARMONICS, NUM_HARMONICS, NUM_SHIFTS, YAW, Correction, monomials
 from eagle_rl.runners import checkpoint as ckpt
 from eagle_rl.runners.files import patiently
 from eagle_rl.runners.plan import Stage
 from eagle_rl.runners.provenance import Provenance
 
-GAINS = (1.0, 0.5, 0.25)
-"""Shares of a step that are tried, in turn, until one makes the cost less: after a whole one a robot may fall."""
+SHARES = (1.0, 0.5, 0.25)
+"""Of a step that are tried, in turn, until one makes the cost less: after a whole one a robot may fall."""
 
+LENGTHS = (0.4, 0.2, 0.1, 0.05)
+"""Changes of all gains together that are tried [s/rad]; the best of them is taken, beyond it the loop rings."""
 MIN_SURVIVAL = 0.25
 """Share of robots that must have stayed up with a change, with its negative and without."""
+
+
+class _TooFewStoodError(Exception):
+    """Nothing can be learned of robots that fall."""
 
 
 @dataclass(frozen=True)
@@ -79,19 +87,17 @@ class CorrectionRunner:
         start = time.perf_counter()
         correction, mirror = self._begin()
         for iteration in range(self.stage.iterations):
-            probe = self._probe(correction, 2 * iteration)
-            if len(probe.command) < MIN_SURVIVAL * self.cfg.correction.num_envs:
-                text = (
-                    f"{self.stage.name}: most robots fell and taught nothing; a correction needs a policy that walks."
-                )
-                warnings.warn(text, EagleWarning, stacklevel=2)
+            before = correction
+            try:
+                correction = self._tune(correction, mirror, 4 * iteration)
+                correction = self._correct(correction, mirror, 4 * iteration + 2)
+            except _TooFewStoodError:
+                reason = "most robots fell and taught nothing; a correction needs a policy that walks"
+                warnings.warn(f"{self.stage.name}: {reason}.", EagleWarning, stacklevel=2)
                 break
-            step = improve(correction, probe, mirror, self.cfg.correction.std, self.cfg.correction.damping)
-            better = self._better(correction, step, 2 * iteration + 1)
             on_iteration()
-            if better is None:
+            if correction is before:
                 break
-            correction = better
         return patiently(lambda: self._save(correction, time.perf_counter() - start))
 
     def _begin(self) -> tuple[Correction, Mirror]:
@@ -102,45 +108,81 @@ class CorrectionRunner:
         low, high = obs["command"]
         slots = obs["slot_mask"][0].nonzero().flatten()
         perm, sign = env.mirror["actions"]
+        scales = self.cfg.task.observations.scales
         width = len(slots) * (2 * NUM_HARMONICS + 1) + NUM_SHIFTS
         correction = Correction(
             weights=low.new_zeros(monomials(obs["command"]).shape[1], width),
             slots=slots,
             middle=(low + high) / 2,
             half_range=(high - low) / 2,
+            gains=low.new_zeros(len(slots), 2 * FEEDBACK_HARMONICS + 1),
+            yaw_scales=low.new_tensor([scales.base_ang_vel, scales.command[YAW]]),
         )
         partner = (perm[slots].unsqueeze(1) == slots).int().argmax(dim=1)
         return correction, Mirror(command=env.mirror["command"], partner=partner, sign=sign[slots])
 
+    def _tune(self, correction: Correction, mirror: Mirror, number: int) -> Correction:
+        """The correction with the gains, along the direction probed, with which other commands are followed best."""
+        std = self.cfg.correction.gain_std
+        if not std:
+            return correction
+        shape = (self.cfg.correction.num_envs, *correction.gains.shape)
+        change = torch.randn(shape, generator=self._generator(number)).to(correction.gains)
+        change = std * math.sqrt(2.0) * symmetric(change, mirror)
+        more, less = (self._follow(correction, number, gains=way * change) for way in (1.0, -1.0))
+        stood = self._require_most(~(more.fell | less.fell))
+        way = descent(change[stood], 0.5 * (more.cost - less.cost)[stood], mirror)
+        candidates = [replace(correction, gains=correction.gains + length * way) for length in (0.0, *LENGTHS)]
+        costs = [self._follow(candidate, number + 1).cost.mean().item() for candidate in candidates]
+        best = costs.index(min(costs))
+        length = (0.0, *LENGTHS)[best]
+        self._tell(f"cost {costs[0]:.3f} -> {costs[best]:.3f} with gains changed by {length:g}")
+        return candidates[best] if best else correction
+
+    def _correct(self, correction: Correction, mirror: Mirror, number: int) -> Correction:
+        """The correction a share of a step further on with which commands that were not probed are followed better."""
+        correcting = self.cfg.correction
+        step = improve(correction, self._probe(correction, number), mirror, correcting.std, correcting.damping)
+        before = self._follow(correction, number + 1).cost.mean().item()
+        for share in SHARES:
+            candidate = replace(correction, weights=correction.weights + share * step)
+            after = self._follow(candidate, number + 1).cost.mean().item()
+            self._tell(f"cost {before:.3f} -> {after:.3f} with {share:.0%} of the step")
+            if after < before:
+                return candidate
+        return correction
+
     def _probe(self, correction: Correction, number: int) -> Probe:
         """Robots with a change, with its negative and without; those that fell are left out."""
-        generator = torch.Generator().manual_seed(self.stage.seed + number)
-        change = torch.randn(self.cfg.correction.num_envs, correction.weights.shape[1], generator=generator)
+        shape = (self.cfg.correction.num_envs, correction.weights.shape[1])
+        change = torch.randn(shape, generator=self._generator(number))
         change = self.cfg.correction.std * change.to(correction.weights)
         more, less, plain = (self._follow(correction, number, way * change) for way in (1.0, -1.0, 0.0))
         answer = 0.5 * (more.waves - less.waves)
         probe = Probe(command=plain.command, change=change, answer=answer, error=plain.waves)
-        return probe.of(~(more.fell | less.fell | plain.fell))
+        return probe.of(self._require_most(~(more.fell | less.fell | plain.fell)))
 
-    def _better(self, correction: Correction, step: Tensor, number: int) -> Correction | None:
-        """The correction a share of a step further on with which commands that were not probed are followed better."""
-        before = self._follow(correction, number).cost.mean().item()
-        for gain in GAINS:
-            candidate = replace(correction, weights=correction.weights + gain * step)
-            after = self._follow(candidate, number).cost.mean().item()
-            outcome = f"{self.stage.name}: cost {before:.3f} -> {after:.3f} with {gain:.0%} of the step"
-            Console(stderr=True).print(outcome, highlight=False)
-            if after < before:
-                return candidate
-        return None
+    def _require_most(self, stood: Tensor) -> Tensor:
+        """The robots that stood, of whom there must be enough to learn from."""
+        if stood.float().mean() < MIN_SURVIVAL:
+            raise _TooFewStoodError
+        return stood
+
+    def _generator(self, number: int) -> torch.Generator:
+        return torch.Generator().manual_seed(self.stage.seed + number)
+
+    def _tell(self, outcome: str) -> None:
+        Console(stderr=True).print(f"{self.stage.name}: {outcome}", highlight=False)
 
     def _env(self, num_envs: int) -> Any:
         """Environments in the finer physics of evaluation, undisturbed, in the same state every time."""
         task = evaluation_task(self.cfg.task, self._ev)
         return self._make_env(self.cfg.robots, num_envs, task, self.stage.seed)
 
-    def _follow(self, correction: Correction, number: int, change: Tensor | float = 0.0) -> _Rollout:
-        """Let robots follow the commands of this number from rest, with coefficients changed."""
+    def _follow(
+        self, correction: Correction, number: int, change: Tensor | float = 0.0, gains: Tensor | float = 0.0
+    ) -> _Rollout:
+        """Let robots follow the commands of this number from rest, with coefficients and gains changed."""
         correcting = self.cfg.correction
         ev = replace(self._ev, seed=self.stage.seed + number)
         drawn = draw_commands(self.cfg.task.commands, ev, self.cfg.robots[0], correcting.num_envs)
@@ -152,7 +194,7 @@ class CorrectionRunner:
         fell = torch.zeros(len(commands), dtype=torch.bool, device=commands.device)
         errors, phases = [], []
         for _ in range(correcting.num_steps):
-            obs, _, dones, extras = env.step(correction.act(self._actor, obs, change))
+            obs, _, dones, extras = env.step(correction.act(self._actor, obs, change, gains))
             fell |= dones.bool() & ~extras["time_outs"].bool()
             errors.append((env.measured_commands().to(commands) - commands) / self._units)
             phases.append(obs["phase"])

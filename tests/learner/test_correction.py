@@ -42,7 +42,14 @@ def normal(*shape: int, seed: int = 0) -> Tensor:
 def correction(weights: Tensor | None = None) -> Correction:
     """For commands from 1 to 3."""
     weights = torch.zeros(21, WIDTH) if weights is None else weights
-    return Correction(weights=weights, slots=SLOTS, middle=torch.full((5,), 2.0), half_range=torch.ones(5))
+    return Correction(
+        weights=weights,
+        slots=SLOTS,
+        middle=torch.full((5,), 2.0),
+        half_range=torch.ones(5),
+        gains=torch.zeros(len(SLOTS), 3),
+        yaw_scales=torch.tensor([0.5, 2.0]),
+    )
 
 
 def even_correction() -> Correction:
@@ -104,10 +111,26 @@ def test_a_policy_is_told_more_of_a_velocity_in_shift_units():
     torch.testing.assert_close(correction(weights).act(actor, obs), actor(told))
 
 
+def test_a_joint_answers_what_the_robot_turns_too_fast_by_a_gain_that_follows_the_phase():
+    actor, obs = toy()
+    obs["history"][:, 2], obs["command"][:, 2] = 0.5 * 0.7, 2.0 * 0.3  # turns at 0.7 rad/s, told 0.3 rad/s
+    gains = torch.zeros(3, 3)
+    gains[1] = torch.tensor([0.5, 0.0, 0.25])
+    more = dataclasses.replace(correction(), gains=gains).act(actor, obs) - actor(obs)
+    torch.testing.assert_close(more[:, 2], 0.4 * (0.5 + 0.25 * torch.sin(2 * math.pi * obs["phase"])))
+    more[:, 2] = 0.0
+    assert more.abs().max() < 1e-6
+    extra = torch.zeros(len(obs), 3, 3)
+    extra[0, 1] = gains[1]
+    trial = correction().act(actor, obs, extra_gains=extra) - actor(obs)
+    assert trial[0, 2] != 0.0
+    assert trial[1:].abs().max() < 1e-6, "each robot tries gains of its own"
+
+
 def test_a_standing_robot_is_not_corrected():
     actor, obs = toy()
     obs["clock"] = torch.ones_like(obs["clock"])
-    some = correction(normal(21, WIDTH))
+    some = dataclasses.replace(correction(normal(21, WIDTH)), gains=normal(3, 3))
     torch.testing.assert_close(some.act(actor, obs), actor(obs))
 
 

@@ -34,6 +34,7 @@ SEARCH = "eagle_rl/algorithms/search.py"
 SEARCHING = "eagle_rl/runners/searching.py"
 CORRECTION = "eagle_rl/models/correction.py"
 CORRECTING = "eagle_rl/algorithms/correction.py"
+FEEDBACK = "eagle_rl/algorithms/feedback.py"
 TRIALS = "eagle_rl/evaluation/trials.py"
 LOSSES = "eagle_rl/algorithms/losses.py"
 GAUSSIAN = "eagle_rl/models/distribution.py"
@@ -208,9 +209,20 @@ MUTANTS: tuple[Mutant, ...] = (
     ),
     Mutant(CORRECTION, "SHIFT_UNIT * coefficients", "coefficients", "learner/test_correction.py"),
     Mutant(CORRECTION, " + extra) * walks", " + extra)", "learner/test_correction.py"),
+    Mutant(CORRECTION, "unsqueeze(1) * walks", "unsqueeze(1)", "learner/test_correction.py"),
+    Mutant(CORRECTION, "self.yaw_scales[0] - command", "self.yaw_scales[0] + command", "learner/test_correction.py"),
+    Mutant(FEEDBACK, "turned = -half_a_cycle", "turned = half_a_cycle", "learner/test_feedback.py"),
+    Mutant(FEEDBACK, "downhill = -symmetric", "downhill = symmetric", "learner/test_feedback.py"),
+    Mutant(
+        "eagle_rl/runners/correcting.py", "0.5 * (more.cost - less.cost)", "more.cost", "runners/test_correcting.py"
+    ),
+    Mutant(
+        "eagle_rl/runners/root.py", "pad(weights, (0, columns))", "pad(weights, (columns, 0))", "runners/test_root.py"
+    ),
+    Mutant("envs/mdp/gait.py", ".flatten(1)[:, 2:]", ".flatten(1)[:, :-2]", "mdp/test_gait.py"),
     Mutant(CORRECTION, ".clamp(-1.0, 1.0)", "", "learner/test_correction.py"),
     Mutant(
-        CORRECTING, "* _half_a_cycle(NUM_HARMONICS)", "* waves(sign, NUM_HARMONICS)[0]", "learner/test_correction.py"
+        CORRECTING, "* half_a_cycle(NUM_HARMONICS)", "* waves(sign, NUM_HARMONICS)[0]", "learner/test_correction.py"
     ),
     Mutant(CORRECTING, "return -effect @", "return effect @", "learner/test_correction.py"),
     Mutant(CORRECTING, "found[..., 1:] *= ", "found[..., 2:] *= ", "learner/test_correction.py"),

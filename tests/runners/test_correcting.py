@@ -21,8 +21,9 @@ from tests.runners.test_searching import StillToyEnv, make_still_env
 from tests.runners.toy_run import make_toy_env, refuse, toy_experiment, toy_job
 
 CORRECTION = CorrectionCfg(num_envs=64, num_steps=12, settling_steps=2, damping=0.5)
-PROBE = 3 * 64 * 12
-"""Environment steps of a probe; each is followed by two to four looks of a third of that."""
+ROLLOUT = 64 * 12
+PROBE = 3 * ROLLOUT
+"""Environment steps of a probe; it is followed by two to four looks, and gains take seven rollouts before it."""
 
 
 def corrected(folder: Path, probes: int = 2, **changes: float) -> tuple[ExperimentCfg, RunResult]:
@@ -56,7 +57,48 @@ def test_a_correction_makes_robots_follow_better_and_leaves_the_network_alone(tm
 def test_its_steps_are_counted(tmp_path):
     _, result = corrected(tmp_path, probes=1)
     spent = result.records["round1/correct_one"].env_steps
-    assert spent in [PROBE * (3 + looks) // 3 for looks in (2, 3, 4)]
+    assert spent in [(7 + 3 + looks) * ROLLOUT for looks in (2, 3, 4)]
+
+
+def test_no_gains_are_tuned_where_none_are_to_be_tried(tmp_path):
+    _, result = corrected(tmp_path, probes=1, gain_std=0.0)
+    record = result.records["round1/correct_one"]
+    assert record.env_steps in [(3 + looks) * ROLLOUT for looks in (2, 3, 4)]
+    saved = load_correction(final_checkpoint(result.run_dir, "round1/correct_one"))
+    assert saved is not None
+    assert not saved.gains.any()
+
+
+class SpinningToyEnv(StillToyEnv):
+    """Its third joint is what the gyroscope says, and an error of its own pushes it on."""
+
+    def step(self, actions: torch.Tensor):
+        spin = self.frames[:, 0, 2] - self.command[:, 2]
+        pushed = actions.clone()
+        pushed[:, 2] = pushed[:, 2] + 0.5 * spin
+        return super().step(pushed)
+
+
+def test_gains_are_found_that_hold_a_robot_against_what_it_spins_by(tmp_path):
+    plan = toy_experiment(iterations=1, specialist_env_steps=0, correction_env_steps=PROBE)
+    scales = dataclasses.replace(
+        plan.task.observations.scales, base_ang_vel=1.0, command=(1.0,) * 5
+    )  # the toy shows its joints as they are
+    observations = dataclasses.replace(plan.task.observations, scales=scales)
+    cfg = dataclasses.replace(
+        plan,
+        task=dataclasses.replace(plan.task, observations=observations),
+        correction=dataclasses.replace(CORRECTION, gain_std=0.1),
+    )
+
+    def make_env(robots, num_envs, task, seed, first=0):
+        return SpinningToyEnv(num_envs, tuple(robots), seed)
+
+    result = run_experiment(cfg, tmp_path / "run", make_env)
+    for robot in cfg.robots:
+        saved = load_correction(final_checkpoint(result.run_dir, f"round1/correct_{robot}"))
+        assert saved is not None
+        assert saved.gains[2, 0] < -0.03, f"{robot}: the third joint is to be held back: {saved.gains[2]}"
 
 
 def test_it_is_judged_and_teaches_with_its_correction(tmp_path):
