@@ -271,11 +271,13 @@ class EagleRunner(OnPolicyRunner):
     def load_weights(self, path: Path | str) -> None:
         """Start from the learner of a checkpoint: policy, critic, optimiser and learning rate; the rest stays fresh.
 
-        A fresh optimiser at the first learning rate would undo a trained policy in its first update.
+        A fresh optimiser at the first learning rate would undo a trained policy in its first update. Imitation alone
+        has a fresh one: measured by PPO's gradients its first steps would be far longer than its rate says.
         """
         checkpoint = ckpt.load_checkpoint(Path(path), self.provenance.slot_table_hash)
         self._require_same_shapes(checkpoint)
-        self.alg.load(checkpoint.state["algorithm"], {"actor": True, "critic": True, "optimizer": True})
+        goes_on = self.alg.cfg.use_ppo_loss
+        self.alg.load(checkpoint.state["algorithm"], {"actor": True, "critic": True, "optimizer": goes_on})
 
     def _state(self) -> dict[str, Any]:
         """Everything a checkpoint holds; the part of each process is gathered in the first."""

@@ -229,6 +229,15 @@ def test_a_stage_starts_from_the_learner_of_another_with_fresh_counters(tmp_path
     assert all(torch.equal(*pair) for pair in zip(*moments, strict=True))
 
 
+def test_imitation_alone_does_not_measure_its_steps_by_gradients_of_ppo(tmp_path):
+    root = make_runner(tmp_path)
+    stage = make_runner(use_ppo_loss=False)
+    stage.load_weights(root.learn(2))
+    compare(parameters(root), parameters(stage), "weights")
+    assert not stage.alg.optimizer.state_dict()["state"]
+    assert stage.alg.learning_rate == stage.alg.cfg.learning_rate
+
+
 def test_first_episodes_are_staggered_unless_the_run_is_resumed(tmp_path):
     ages = []
 
