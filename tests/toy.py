@@ -7,6 +7,7 @@ own.
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import torch
@@ -39,6 +40,7 @@ class ToyEnv(VecEnv):
         self.robot = torch.arange(num_envs) % len(robots)
         joints = torch.tensor([ROBOTS[name][0] for name in robots])[self.robot]
         self.mask = (torch.arange(NUM_SLOTS) < joints[:, None]).float()
+        self.robots = SimpleNamespace(action_scale=self.mask)
         self.mass = torch.tensor([ROBOTS[name][1] for name in robots])[self.robot, None]
         names = [robots[i] for i in self.robot.tolist()]
         self.rng = CounterRng(seed, names, torch.arange(num_envs) // len(robots))

@@ -197,9 +197,9 @@ class CorrectionCfg:
     gain_std: float = 0.03
     """Of the changes tried of every gain by which a joint answers the yaw rate's error [s/rad]; 0 tunes none."""
     std: float = 0.03
-    """Of the changes tried, in units of action, for every joint and harmonic [-]."""
+    """Of the changes tried for every joint and harmonic [-]; 1 is an angle, an action's in the geometric mean."""
     damping: float = 6.0
-    """Number of error units that weigh as much as a change of one unit of action [-]; with less of it robots fall."""
+    """Number of error units that weigh as much as a change of 1 [-]; with less of it robots fall."""
 
 
 @dataclass(frozen=True, kw_only=True)

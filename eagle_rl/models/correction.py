@@ -60,12 +60,14 @@ class Correction:
     """Shape (21, S (2 NUM_HARMONICS + 1) + NUM_SHIFTS)."""
     slots: Tensor
     """Slots that are corrected, shape (S,)."""
+    units: Tensor
+    """Action by which a coefficient of 1 changes each of them, shape (S,): the same angle, whatever an action's is."""
     middle: Tensor
     """Of the scaled commands' ranges, shape (5,)."""
     half_range: Tensor
     """Half the width of those, shape (5,)."""
     gains: Tensor
-    """Action per error of the yaw rate [s/rad], times :func:`waves`, shape (S, 2 FEEDBACK_HARMONICS + 1)."""
+    """Units per error of the yaw rate [s/rad], times :func:`waves`, shape (S, 2 FEEDBACK_HARMONICS + 1)."""
     yaw_scales: Tensor
     """Of the yaw rate and of its command in the observations, shape (2,)."""
 
@@ -103,7 +105,7 @@ class Correction:
         more = (by_joint * waving).sum(dim=2)
         gains = ((self.gains + extra_gains) * waving[..., : self.gains.shape[1]]).sum(dim=2)
         more += gains * self.yaw_error(history, command).unsqueeze(1) * walks
-        return actions.index_add(1, self.slots, more)
+        return actions.index_add(1, self.slots, self.units * more)
 
     def state_dict(self) -> dict[str, Tensor]:
         """Arguments of the constructor."""

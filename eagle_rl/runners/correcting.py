@@ -108,11 +108,13 @@ class CorrectionRunner:
         low, high = obs["command"]
         slots = obs["slot_mask"][0].nonzero().flatten()
         perm, sign = env.mirror["actions"]
+        scale = env.robots.action_scale[0, slots].to(low)  # a stiff joint's action is worth a small angle
         scales = self.cfg.task.observations.scales
         width = len(slots) * (2 * NUM_HARMONICS + 1) + NUM_SHIFTS
         correction = Correction(
             weights=low.new_zeros(monomials(obs["command"]).shape[1], width),
             slots=slots,
+            units=scale.log().mean().exp() / scale,
             middle=(low + high) / 2,
             half_range=(high - low) / 2,
             gains=low.new_zeros(len(slots), 2 * FEEDBACK_HARMONICS + 1),

@@ -45,6 +45,7 @@ def correction(weights: Tensor | None = None) -> Correction:
     return Correction(
         weights=weights,
         slots=SLOTS,
+        units=torch.tensor([1.0, 1.0, 0.5]),
         middle=torch.full((5,), 2.0),
         half_range=torch.ones(5),
         gains=torch.zeros(len(SLOTS), 3),
@@ -100,6 +101,14 @@ def test_a_joint_gets_its_harmonics_and_nobody_else_does():
     torch.testing.assert_close(more[:, 2], 0.5 * torch.sin(2 * math.pi * obs["phase"]))
     more[:, 2] = 0.0
     assert more.abs().max() < 1e-6
+
+
+def test_a_coefficient_is_an_angle_where_an_action_is_worth_more_or_less_of_it():
+    actor, obs = toy()
+    weights = torch.zeros(21, WIDTH)
+    weights[0, 2 * (2 * NUM_HARMONICS + 1)] = 0.5  # of the third joint, the constant; its unit is 0.5
+    more = correction(weights).act(actor, obs) - actor(obs)
+    torch.testing.assert_close(more[:, 5], torch.full((len(obs),), 0.25))
 
 
 def test_a_policy_is_told_more_of_a_velocity_in_shift_units():
