@@ -130,14 +130,18 @@ def main(argv: Sequence[str]) -> int:
     from eagle_rl.runners.checkpoint import publish_policy
 
     policy = load_policy(args.checkpoint)
-    if policy.act is not policy.actor:
+    corrected = policy.act is not policy.actor
+    if corrected and args.publish is None:
         raise ConfigError(
-            f"{policy.checkpoint}: a corrected specialist, whose correction reads the gait's phase, which no exported "
-            "policy gets. Export the generalist that was distilled from it, or the stage before the correction."
+            f"{policy.checkpoint}: a corrected specialist, whose correction reads the gait's phase, which no ONNX "
+            "policy gets. Publish it without ONNX (--publish), or export the generalist that was distilled from it."
         )
     if args.publish is not None:
         policy = load_policy(publish_policy(policy.checkpoint, args.publish, policy.env_steps))
         print(f"{policy.checkpoint}, with its manifest in {policy.checkpoint.with_suffix('.json').name}")
+        if corrected:
+            print("no ONNX: its correction reads the gait's phase, which no ONNX policy gets")
+            return 0
     contract = build_contract(policy.cfg, policy.sha256, policy.cfg.robots)
     stem = policy.checkpoint.stem
     name = stem if args.publish else f"{stem}_{contract.digest[:8]}"

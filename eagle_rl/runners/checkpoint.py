@@ -30,6 +30,8 @@ from eagle_rl.runners.provenance import Provenance
 
 FORMAT_VERSION = 1
 MAX_MANIFEST_BYTES = 4 << 20
+_CORRECTION = "correction."
+"""What the names of a correction's tensors begin with in a published file."""
 
 Manifest = dict[str, Any]
 
@@ -119,7 +121,8 @@ def load_actor(
     """
     path = Path(path)
     if path.suffix == published.SUFFIX:
-        weights, architecture, manifest = published.read_published(path)
+        tensors, architecture, manifest = published.read_published(path)
+        weights = {name: x for name, x in tensors.items() if not name.startswith(_CORRECTION)}
         _require_slot_table(path, manifest, slot_table_hash)
     else:
         checkpoint = load_checkpoint(path, slot_table_hash)
@@ -135,14 +138,23 @@ def load_actor(
 
 
 def load_correction(path: Path, device: str | torch.device = "cpu") -> Correction | None:
-    """What a checkpoint's policy is corrected by, if anything; a published policy has nothing of the kind."""
+    """What the policy of a checkpoint or of a published file is corrected by, if anything."""
     path = Path(path)
-    saved = None if path.suffix == published.SUFFIX else load_checkpoint(path, device=device).state.get("correction")
-    return None if saved is None else Correction(**saved)
+    if path.suffix == published.SUFFIX:
+        tensors = published.read_published(path)[0]
+        saved = {name.removeprefix(_CORRECTION): x for name, x in tensors.items() if name.startswith(_CORRECTION)}
+    else:
+        saved = load_checkpoint(path).state.get("correction", {})
+    try:
+        return Correction(**{name: x.to(device) for name, x in saved.items()}) if saved else None
+    except TypeError as error:
+        raise CheckpointError(f"{path}: holds a correction of another version: {error}. Correct it again.") from error
 
 
 def publish_policy(path: Path, target: Path, env_steps: int | None = None) -> Path:
     """Write the policy of a checkpoint as safetensors, for readers its manifest beside it; return the former's path.
+
+    A corrected specialist takes its correction along.
 
     Args:
         path: the checkpoint.
@@ -151,7 +163,8 @@ def publish_policy(path: Path, target: Path, env_steps: int | None = None) -> Pa
     """
     checkpoint = load_checkpoint(path)
     target = target.with_suffix(published.SUFFIX)
-    weights = checkpoint.state["algorithm"]["actor_state_dict"]
+    correction = {f"{_CORRECTION}{name}": x for name, x in checkpoint.state.get("correction", {}).items()}
+    weights = checkpoint.state["algorithm"]["actor_state_dict"] | correction
     manifest = checkpoint.manifest | ({} if env_steps is None else {"env_steps": env_steps})
     published.write_published(target, weights, checkpoint.state["architecture"], manifest)
     data = target.read_bytes()

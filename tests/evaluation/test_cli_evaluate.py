@@ -58,8 +58,20 @@ def test_a_corrected_specialist_is_judged_with_its_correction(corrected):
 
 
 def test_a_corrected_specialist_is_not_exported_without_its_correction(corrected):
-    with pytest.raises(ConfigError, match="Export the generalist that was distilled from it"):
+    with pytest.raises(ConfigError, match="export the generalist that was distilled from it"):
         export([str(corrected)])
+
+
+def test_a_corrected_specialist_is_published_with_its_correction_and_without_onnx(corrected, tmp_path, capsys):
+    assert export([str(corrected), "--publish", str(tmp_path / "h1")]) == 0
+    assert "no ONNX" in capsys.readouterr().out
+    assert {path.name for path in tmp_path.iterdir()} == {"h1.safetensors", "h1.json"}
+    policy, original = load_policy(tmp_path / "h1.safetensors"), load_policy(corrected)
+    assert isinstance(policy.act, CorrectedPolicy)
+    for name, value in original.act.correction.state_dict().items():
+        assert torch.equal(policy.act.correction.state_dict()[name], value), name
+    obs = make_env_factory(policy.cfg.run)(["h1"], 2, policy.cfg.task, 1).get_observations()
+    assert torch.equal(policy.act(obs), original.act(obs))
 
 
 def test_a_run_becomes_a_table_with_hash_protocol_and_seed(run, tmp_path, capsys):

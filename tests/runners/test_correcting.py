@@ -12,8 +12,9 @@ from eagle_rl.config.schema import CorrectionCfg, ExperimentCfg
 from eagle_rl.errors import CheckpointError, EagleWarning
 from eagle_rl.models.correction import CorrectedPolicy
 from eagle_rl.runners import correcting
-from eagle_rl.runners.checkpoint import load_actor, load_checkpoint, load_correction
+from eagle_rl.runners.checkpoint import load_actor, load_checkpoint, load_correction, save_checkpoint
 from eagle_rl.runners.plan import plan_stages
+from eagle_rl.runners.provenance import Provenance
 from eagle_rl.runners.records import final_checkpoint
 from eagle_rl.runners.stages import RunResult, run_experiment
 from eagle_rl.runners.training import load_policy, train
@@ -117,6 +118,15 @@ def test_a_correction_that_makes_nothing_better_is_dropped(tmp_path, monkeypatch
     saved = load_correction(path)
     assert saved is not None
     assert not saved.weights.any(), "coefficients of 3 throw any robot over"
+
+
+def test_a_correction_of_another_version_is_refused_in_words(tmp_path):
+    _, result = corrected(tmp_path, probes=1)
+    state = load_checkpoint(final_checkpoint(result.run_dir, "round1/correct_one")).state
+    del state["correction"]["gains"]
+    path = save_checkpoint(tmp_path, state, Provenance(), iteration=1, env_steps=0)
+    with pytest.raises(CheckpointError, match=r"another version: .*'gains'.*\. Correct it again"):
+        load_correction(path)
 
 
 def test_nothing_is_trained_on_from_a_corrected_specialist(tmp_path):
