@@ -233,6 +233,8 @@ class RewardWeightsCfg:
     """Inherited."""
     joint_limits: float = -10.0
     """Inherited: radians beyond the soft limits, for the hardware's sake."""
+    landing: float = 0.0
+    """Speed of a foot about to touch down, which turns the pelvis (ours, a penalty)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -259,6 +261,8 @@ class RewardsCfg:
     """[m^2/s^2] (paper)."""
     foot_swing_clip: float = 0.1
     """Bound on the summed squared swing error [m^2] (HugWBC 4)."""
+    landing_height: float = 0.05
+    """Height of a sole at which ``landing`` counts for 1/e of what it does on the ground [m] (ours)."""
     soft_limit_ratio: float = 0.9
     """Share of the joint range inside which ``joint_limits`` is zero [-] (HugWBC 4)."""
     penalty_initial: float = 0.2

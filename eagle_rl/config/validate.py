@@ -36,7 +36,7 @@ BOUNDS: dict[str, _Bound] = dict.fromkeys(
     task.observations.history_length task.observations.clip
     task.rewards.tracking_kappa task.rewards.standing_kappa task.rewards.walking_kappa task.rewards.contact_vel_kappa
     task.rewards.contact_force_kappa task.rewards.foot_slip_kappa
-    task.rewards.foot_swing_clip task.rewards.penalty_interval_steps
+    task.rewards.foot_swing_clip task.rewards.landing_height task.rewards.penalty_interval_steps
     task.terminations.episode_length_s task.terminations.max_roll task.terminations.max_pitch
     task.randomization.push_interval_s task.aids.interval_steps
     algo.num_steps_per_env algo.num_learning_epochs algo.num_mini_batches algo.clip_param algo.learning_rate
@@ -126,7 +126,7 @@ def _is_number(value: Any) -> bool:
 def _scalar_fault(path: str, value: float, default: float) -> str | None:
     if path.startswith(_WEIGHTS):
         sign = "0 or more, it is a reward" if default > 0 else "0 or less, it is a penalty"
-        return None if value * default >= 0 else f"got {value!r}, expected {sign}"
+        return None if value * (default or -1.0) >= 0 else f"got {value!r}, expected {sign}"
     if value > CEILINGS.get(path, math.inf):
         return f"got {value!r}, expected at most {CEILINGS[path]:g}"
     words, holds = BOUNDS.get(path, _NOT_NEGATIVE)

@@ -1,4 +1,4 @@
-"""Reward terms: the paper's table row by row, then the three terms it inherits without printing them.
+"""Reward terms: the paper's table row by row, the three it inherits without printing them, and one of ours.
 
 Every term is a pure function of one control step and returns the unweighted value, shape (N,). Terms that measure an
 error are positive and have a negative weight in ``RewardWeightsCfg``. ``compute_rewards`` weights and sums them.
@@ -164,6 +164,16 @@ def foot_slip(state: PooledState, robots: PooledRobots, ctx: RewardContext) -> T
     return _dot(contact, 1.0 - _rho(ctx.once(_foot_speed, state, robots), ctx.cfg.foot_slip_kappa))
 
 
+def landing(state: PooledState, robots: PooledRobots, ctx: RewardContext) -> Tensor:
+    """``sum_j air_j down_j exp(-l_j / l_0) |v_j|^2``: a foot that comes down should stop first [m^2/s^2], an error.
+
+    Over feet without contact that move down, at the height l_j of their soles (ours; docs/experiments.md, 23).
+    """
+    coming_down = ~state.foot_contact & (state.foot_vel_w[..., 2] < 0)
+    near = torch.exp(state.foot_height.clamp(min=0.0) / -ctx.cfg.landing_height)
+    return _dot(near * coming_down, _square_sum(state.foot_vel_w))
+
+
 def action_rate(state: PooledState, robots: PooledRobots, ctx: RewardContext) -> Tensor:
     """``|a_t - a_(t-1)|^2`` [-], an error (Action rate)."""
     return _square_sum((state.actions - state.last_actions) * robots.slot_mask)
@@ -255,6 +265,7 @@ REWARD_TERMS: dict[str, RewardTerm] = {
     "termination": RewardTerm(termination),
     "alive": RewardTerm(alive),
     "joint_limits": RewardTerm(joint_limits),
+    "landing": RewardTerm(landing),
 }
 """Every term by its name in ``RewardWeightsCfg``."""
 

@@ -43,6 +43,7 @@ PRINTED_TABLE = {
 """Coefficients of the paper's table "Training reward terms", top to bottom."""
 INHERITED = {"termination": -200, "alive": 0.2, "joint_limits": -10}
 """Terms the paper keeps from HugWBC without printing them."""
+OURS = {"landing": 0}
 PENALTY_CURRICULUM = {
     "base_height",
     "body_pitch",
@@ -90,7 +91,7 @@ def slot_values(**angles: float) -> torch.Tensor:
 
 def test_paper_mode_has_the_printed_coefficients() -> None:
     weights = {f.name: getattr(RewardWeightsCfg(), f.name) for f in fields(RewardWeightsCfg)}
-    assert weights == PRINTED_TABLE | INHERITED
+    assert weights == PRINTED_TABLE | INHERITED | OURS
 
 
 def test_paper_mode_has_the_printed_kernels() -> None:
@@ -229,6 +230,25 @@ def test_foot_slip_counts_feet_in_contact_now_or_one_step_ago(
     feet = torch.tensor([[0.3, 0.4, 3.0], [0.0, 0.0, 0.0]])
     state = state_with(foot_vel_w=feet, foot_force_w=[0.0, 0.0, force], last_foot_contact=last_contact)
     assert value("foot_slip", state) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("vertical", "height", "force", "expected"),
+    [
+        (-1.2, 0.0, 0.0, 1.69),  # 0.3^2 + 0.4^2 + 1.2^2
+        (-1.2, 0.05, 0.0, 1.69 / math.e),
+        (-1.2, -0.01, 0.0, 1.69),
+        (1.2, 0.0, 0.0, 0.0),
+        (-1.2, 0.0, 2.0, 0.0),
+    ],
+    ids=["down on the ground", "down at the height", "into the ground", "up", "has landed"],
+)
+def test_landing_counts_the_speed_of_feet_that_come_down(
+    vertical: float, height: float, force: float, expected: float
+) -> None:
+    feet = torch.tensor([[0.3, 0.4, vertical], [0.0, 0.0, 0.0]])
+    state = state_with(foot_vel_w=feet, foot_height=[height, 0.2], foot_force_w=[0.0, 0.0, force])
+    assert value("landing", state) == pytest.approx(expected)
 
 
 def test_action_rate_and_smoothness() -> None:
