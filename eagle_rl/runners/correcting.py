@@ -29,7 +29,7 @@ from eagle_rl.runners.provenance import Provenance
 SHARES = (1.0, 0.5, 0.25)
 """Of a step that are tried, in turn, until one makes the cost less: after a whole one a robot may fall."""
 
-LENGTHS = (0.4, 0.2, 0.1, 0.05)
+LENGTHS = (0.8, 0.4, 0.2, 0.1)
 """Changes of all gains together that are tried [s/rad]; the best of them is taken, beyond it the loop rings."""
 MIN_SURVIVAL = 0.25
 """Share of robots that must have stayed up with a change, with its negative and without."""
@@ -124,17 +124,17 @@ class CorrectionRunner:
         return correction, Mirror(command=env.mirror["command"], partner=partner, sign=sign[slots])
 
     def _tune(self, correction: Correction, mirror: Mirror, number: int) -> Correction:
-        """The correction with the gains, along the direction probed, with which other commands are followed best."""
+        """The correction with the gains, downhill of its own, with which commands not probed are followed best."""
         std = self.cfg.correction.gain_std
         if not std:
             return correction
         shape = (self.cfg.correction.num_envs, *correction.gains.shape)
         change = torch.randn(shape, generator=self._generator(number)).to(correction.gains)
-        change = std * math.sqrt(2.0) * symmetric(change, mirror)
+        change = std * math.sqrt(2.0) * symmetric(change, mirror)  # of which both halves are alike
         more, less = (self._follow(correction, number, gains=way * change) for way in (1.0, -1.0))
         stood = self._require_most(~(more.fell | less.fell))
-        way = descent(change[stood], 0.5 * (more.cost - less.cost)[stood], mirror)
-        candidates = [replace(correction, gains=correction.gains + length * way) for length in (0.0, *LENGTHS)]
+        downhill = descent(change[stood], 0.5 * (more.cost - less.cost)[stood], mirror)
+        candidates = [replace(correction, gains=correction.gains + length * downhill) for length in (0.0, *LENGTHS)]
         costs = [self._follow(candidate, number + 1).cost.mean().item() for candidate in candidates]
         best = costs.index(min(costs))
         length = (0.0, *LENGTHS)[best]
@@ -142,7 +142,7 @@ class CorrectionRunner:
         return candidates[best] if best else correction
 
     def _correct(self, correction: Correction, mirror: Mirror, number: int) -> Correction:
-        """The correction a share of a step further on with which commands that were not probed are followed better."""
+        """The correction a share of a step further on, if commands that were not probed are followed better there."""
         correcting = self.cfg.correction
         step = improve(correction, self._probe(correction, number), mirror, correcting.std, correcting.damping)
         before = self._follow(correction, number + 1).cost.mean().item()
