@@ -26,8 +26,6 @@ NUM_FEET = 2
 """Leading columns of the clock: the sine of each foot's phase."""
 STANDING_CLOCK = 0.999
 """Both feet's sines are above this only where the robot stands, which is not corrected."""
-
-
 FEEDBACK_HARMONICS = 1
 """Of the gait, by which a gain may vary: a foot in stance can turn the pelvis, one in swing cannot."""
 YAW = 2

@@ -85,6 +85,8 @@ def widen_clock(state: dict[str, Any], columns: int) -> dict[str, Any]:
     moments = dict(optimizer["state"])
     for name in networks:
         at = parameters.index(f"{name}.{_FIRST_LAYER}")
+        if at not in moments:  # an optimiser that has made no step
+            continue
         squares = moments[at]["exp_avg_sq"]
         new = squares.mean(dim=1, keepdim=True).expand(-1, columns)
         wider = {"exp_avg": zeros(moments[at]["exp_avg"]), "exp_avg_sq": torch.cat((squares, new), dim=1)}

@@ -67,6 +67,15 @@ def test_the_optimiser_expects_of_new_weights_what_it_knows_of_their_neighbours(
         assert wide[number]["step"] == narrow[number]["step"]
 
 
+def test_an_optimiser_that_has_made_no_step_has_no_moments_to_widen(root):
+    state = load_checkpoint(root).state
+    state["algorithm"]["optimizer_state_dict"]["state"] = {}
+    algorithm = widen_clock(state, 10)["algorithm"]
+    assert algorithm["optimizer_state_dict"]["state"] == {}
+    narrow = state["algorithm"]["actor_state_dict"]["mlp.0.weight"]
+    assert algorithm["actor_state_dict"]["mlp.0.weight"].shape[1] == narrow.shape[1] + 10
+
+
 def test_training_goes_on_from_it_and_uses_what_is_new(root, tmp_path):
     cfg = continued(root, method="eagle")
     result = run_experiment(cfg, tmp_path / "run", make_toy_env)
