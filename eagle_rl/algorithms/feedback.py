@@ -1,7 +1,7 @@
 """Which way to change the gains with which a walking policy answers an error of its yaw rate.
 
-PPO sees the yaw rate through sensor noise as large as what the pelvis swings by, and under its own noise: it answers
-less than pays (docs/experiments.md, 23). Gains are few, and so are found directly: change all of them a little one way
+PPO, which sees the yaw rate through sensor noise and under its own, had come to answer less than pays
+(docs/experiments.md, 23). Gains are few, and so are found directly: change all of them a little one way
 and the other way, on many robots at once, and regress what that does to the cost on the changes (Spall 1992,
 simultaneous perturbation, with a regression in place of the mean).
 """

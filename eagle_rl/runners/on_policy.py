@@ -272,7 +272,7 @@ class EagleRunner(OnPolicyRunner):
         """Start from the learner of a checkpoint: policy, critic, optimiser and learning rate; the rest stays fresh.
 
         A fresh optimiser at the first learning rate would undo a trained policy in its first update. Imitation alone
-        has a fresh one: measured by PPO's gradients its first steps would be far longer than its rate says.
+        has a fresh one: measured by PPO's gradients its first steps would be several times as long as its rate says.
         """
         checkpoint = ckpt.load_checkpoint(Path(path), self.provenance.slot_table_hash)
         self._require_same_shapes(checkpoint)
