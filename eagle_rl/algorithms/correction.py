@@ -1,7 +1,7 @@
 """How a walking policy's errors answer to a correction, and which correction makes them least.
 
 On flat ground the errors of a policy that walks are functions of its command and of the phase of its gait: polynomials
-of degree two explain most of them (docs/experiments.md, 22). So they can be taken off like the repeating errors of a
+explain most of them (docs/experiments.md, 22). So they can be taken off like the repeating errors of a
 machine tool: change the policy a little one way and the other way, see what that does to the mean and to every harmonic
 of every error, and solve (iterative learning control; Bristow, Tharayil and Alleyne 2006, "A survey of iterative
 learning control"). A rollout answers in 105 numbers here where a search gets one.
@@ -23,6 +23,8 @@ VARIATION = 0.3
 """How much the answer may differ over the commands, as a share of what it has in common."""
 SHRINKAGE = 100.0
 """Ridge of the answer, in variances of a coefficient; what a held-out fifth of the rollouts asked for."""
+MAX_HARM = 2.0
+"""Harm, or help, a robot is counted for at most, so that one that falls does not outvote all others [error units]."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +102,7 @@ def improve(correction: Correction, probe: Probe, mirror: Mirror, std: float, da
         damping: coefficient at which a change costs as much as an error of one unit.
 
     Returns:
-        The shape of ``correction.weights``.
+        The shape of ``correction.weights`` without that of the passes.
     """
     probe = mirror.both(probe)
     command = correction.normalised(probe.command)
@@ -110,6 +112,26 @@ def improve(correction: Correction, probe: Probe, mirror: Mirror, std: float, da
     smooth = basis @ _ridge(basis, probe.error.flatten(1))
     steps = [_solve(rows, answer, goal, damping) for rows, goal in zip(context, smooth, strict=True)]
     return _ridge(basis, torch.stack(steps))
+
+
+def expected_harm(correction: Correction, command: Tensor, harm: Tensor, mirror: Mirror) -> Tensor:
+    """By how much a change makes following worse, as a polynomial of the command.
+
+    At the corners of the commands, where robots hardly stand, a step that helps elsewhere may throw them over
+    (docs/experiments.md, 25).
+
+    Args:
+        correction: tells the commands' ranges.
+        command: scaled, of M robots, shape (M, 5).
+        harm: cost with the change less the cost without [error units], shape (M,).
+        mirror: of the robot; the harm at a mirrored command is the same.
+
+    Returns:
+        Weights of the monomials, shape (56,).
+    """
+    perm, sign = mirror.command
+    basis = monomials(correction.normalised(torch.cat((command, command[:, perm] * sign))))
+    return _ridge(basis, harm.clamp(-MAX_HARM, MAX_HARM).repeat(2).unsqueeze(1)).squeeze(1)
 
 
 def _linear_answer(context: Tensor, change: Tensor, answer: Tensor, ridge: float) -> Tensor:

@@ -1,12 +1,13 @@
 """A policy with a correction: what is added to its command and its action.
 
-A part of it depends on command and phase alone; a smaller one answers the error of the yaw rate.
+A part of it depends on command and phase alone; a smaller one answers the error of the yaw rate. It is made in passes,
+each of which is trusted where it was seen to help.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from itertools import combinations_with_replacement
 
 import torch
@@ -30,6 +31,12 @@ FEEDBACK_HARMONICS = 1
 """Of the gait, by which a gain may vary: a foot in stance can turn the pelvis, one in swing cannot."""
 YAW = 2
 """Column of the yaw rate in the newest frame, and of its command."""
+DEGREE = 3
+"""Of the polynomials of the command."""
+DOUBT = 0.05
+"""Harm, and help, within which trust passes from nearly all to nearly nothing [error units]."""
+TRUSTED = -1.0
+"""Harm expected of a new pass at every command, until something is known about it [error units]."""
 
 
 def half_a_cycle(num_harmonics: int) -> Tensor:
@@ -45,17 +52,21 @@ def waves(phase: Tensor, num_harmonics: int) -> Tensor:
 
 
 def monomials(x: Tensor) -> Tensor:
-    """1, every number of ``x`` (N, 5) and every product of two of them, shape (N, 21)."""
-    pairs = [x[:, i] * x[:, j] for i, j in combinations_with_replacement(range(x.shape[1]), 2)]
-    return torch.cat((torch.ones_like(x[:, :1]), x, torch.stack(pairs, dim=1)), dim=1)
+    """Products of up to ``DEGREE`` numbers of ``x`` (N, 5): 1, the numbers, and so on; shape (N, 56)."""
+    with_one = torch.cat((torch.ones_like(x[:, :1]), x), dim=1)
+    factors = list(combinations_with_replacement(range(with_one.shape[1]), DEGREE))
+    return with_one[:, factors].prod(dim=2)
 
 
 @dataclass(frozen=True)
 class Correction:
-    """Coefficients of :func:`waves` for every joint, and of the commands, as polynomials of the command; gains."""
+    """Coefficients of :func:`waves` for every joint, and of the commands, as polynomials of the command; gains.
+
+    Those of I passes add up.
+    """
 
     weights: Tensor
-    """Shape (21, S (2 NUM_HARMONICS + 1) + NUM_SHIFTS)."""
+    """Of the monomials, shape (I, 56, S (2 NUM_HARMONICS + 1) + NUM_SHIFTS)."""
     slots: Tensor
     """Slots that are corrected, shape (S,)."""
     units: Tensor
@@ -65,7 +76,9 @@ class Correction:
     half_range: Tensor
     """Half the width of those, shape (5,)."""
     gains: Tensor
-    """Units per error of the yaw rate [s/rad], times :func:`waves`, shape (S, 2 FEEDBACK_HARMONICS + 1)."""
+    """Units per error of the yaw rate [s/rad], times :func:`waves`, shape (I, S, 2 FEEDBACK_HARMONICS + 1)."""
+    harm: Tensor
+    """Weights of the monomials: by how much a pass makes following worse [error units], shape (I, 56)."""
     yaw_scales: Tensor
     """Of the yaw rate and of its command in the observations, shape (2,)."""
 
@@ -73,9 +86,27 @@ class Correction:
         """Scaled commands (N, 5) as shares of their ranges, in [-1, 1]; beyond these a polynomial would run away."""
         return ((command - self.middle) / self.half_range).clamp(-1.0, 1.0)
 
-    def coefficients(self, command: Tensor) -> Tensor:
-        """Of scaled commands (N, 5), shape (N, S (2 NUM_HARMONICS + 1) + NUM_SHIFTS)."""
-        return monomials(self.normalised(command)) @ self.weights
+    def at(self, command: Tensor) -> tuple[Tensor, Tensor]:
+        """Coefficients (N, S (2 NUM_HARMONICS + 1) + NUM_SHIFTS) and gains (N, S, ...) at scaled commands (N, 5)."""
+        basis = monomials(self.normalised(command))
+        trust = torch.sigmoid(basis @ self.harm.T / -DOUBT)
+        trusted = (trust.unsqueeze(2) * basis.unsqueeze(1)).flatten(1)
+        return trusted @ self.weights.flatten(0, 1), torch.einsum("ni,isw->nsw", trust, self.gains)
+
+    def with_pass(self) -> Correction:
+        """The same, and one more pass, which as yet adds nothing."""
+        harm = self.harm.new_zeros(1, self.harm.shape[1])
+        harm[:, 0] = TRUSTED
+        return replace(
+            self,
+            weights=torch.cat((self.weights, self.weights.new_zeros(1, *self.weights.shape[1:]))),
+            gains=torch.cat((self.gains, self.gains.new_zeros(1, *self.gains.shape[1:]))),
+            harm=torch.cat((self.harm, harm)),
+        )
+
+    def last(self, **fields: Tensor) -> Correction:
+        """The same with other ``weights``, ``gains`` or ``harm`` of the last pass."""
+        return replace(self, **{name: torch.cat((getattr(self, name)[:-1], x[None])) for name, x in fields.items()})
 
     def yaw_error(self, history: Tensor, command: Tensor) -> Tensor:
         """How much faster the robot turns than it is told to, as its gyroscope says [rad/s], shape (N,)."""
@@ -94,15 +125,16 @@ class Correction:
         """
         history, command, clock = (obs[group] for group in ACTOR_INPUTS)
         walks = clock[:, :NUM_FEET].amin(dim=1, keepdim=True) < STANDING_CLOCK
-        coefficients = (self.coefficients(command) + extra) * walks
+        coefficients, gains = self.at(command)
+        coefficients = (coefficients + extra) * walks
         shift = torch.zeros_like(command)
         shift[:, :NUM_SHIFTS] = SHIFT_UNIT * coefficients[:, -NUM_SHIFTS:]
         actions = actor.mean_actions(history, command + shift, clock, obs["slot_mask"])
         by_joint = coefficients[:, :-NUM_SHIFTS].unflatten(1, (len(self.slots), -1))
         waving = waves(obs["phase"], NUM_HARMONICS).unsqueeze(1)
         more = (by_joint * waving).sum(dim=2)
-        gains = ((self.gains + extra_gains) * waving[..., : self.gains.shape[1]]).sum(dim=2)
-        more += gains * self.yaw_error(history, command).unsqueeze(1) * walks
+        gain = ((gains + extra_gains) * waving[..., : gains.shape[2]]).sum(dim=2)
+        more += gain * self.yaw_error(history, command).unsqueeze(1) * walks
         return actions.index_add(1, self.slots, self.units * more)
 
     def state_dict(self) -> dict[str, Tensor]:

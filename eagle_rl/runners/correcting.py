@@ -14,7 +14,7 @@ import torch
 from rich.console import Console
 from torch import Tensor
 
-from eagle_rl.algorithms.correction import Mirror, Probe, error_waves, improve
+from eagle_rl.algorithms.correction import Mirror, Probe, error_waves, expected_harm, improve
 from eagle_rl.algorithms.feedback import descent, symmetric
 from eagle_rl.config.schema import EvaluationCfg, ExperimentCfg
 from eagle_rl.errors import EagleWarning
@@ -26,11 +26,12 @@ from eagle_rl.runners.files import patiently
 from eagle_rl.runners.plan import Stage
 from eagle_rl.runners.provenance import Provenance
 
-SHARES = (1.0, 0.5, 0.25)
-"""Of a step that are tried, in turn, until one makes the cost less: after a whole one a robot may fall."""
-
+SHARES = (1.0, 0.5)
+"""Of a step that are tried: after a whole one a robot may fall."""
 LENGTHS = (0.8, 0.4, 0.2, 0.1)
 """Changes of all gains together that are tried [s/rad]; the best of them is taken, beyond it the loop rings."""
+MIN_TRUSTED = 0.1
+"""Share of the commands a pass must help at; with less it may well be chance that it seems to."""
 MIN_SURVIVAL = 0.25
 """Share of robots that must have stayed up with a change, with its negative and without."""
 
@@ -68,9 +69,10 @@ class CorrectionRunner:
         self._learner = ckpt.load_checkpoint(init, provenance.slot_table_hash).state
         self._actor = ckpt.load_actor(init, cfg.run.env_device)[0]
         fine = cfg.evaluation  # footfalls ring on otherwise at other steps, and so does what answers them
-        self._ev = EvaluationCfg(
+        self._calm = EvaluationCfg(
             num_steps=cfg.correction.num_steps, physics_dt=fine.physics_dt, decimation=fine.decimation
         )
+        self._rough = replace(self._calm, randomization=True, noise=True)
         self._units = torch.tensor(cfg.search.error_units, device=cfg.run.env_device)
         self._limits = torch.tensor(
             [getattr(cfg.task.commands, name).finishing for name in COMMANDS], device=cfg.run.env_device
@@ -87,10 +89,10 @@ class CorrectionRunner:
         start = time.perf_counter()
         correction, mirror = self._begin()
         for iteration in range(self.stage.iterations):
-            before = correction
+            before, number = correction, 5 * iteration
             try:
-                correction = self._tune(correction, mirror, 4 * iteration)
-                correction = self._correct(correction, mirror, 4 * iteration + 2)
+                tuned = self._tune(before.with_pass(), mirror, number)
+                correction = self._correct(before, tuned, mirror, number + 2)
             except _TooFewStoodError:
                 reason = "most robots fell and taught nothing; a correction needs a policy that walks"
                 warnings.warn(f"{self.stage.name}: {reason}.", EagleWarning, stacklevel=2)
@@ -102,7 +104,7 @@ class CorrectionRunner:
 
     def _begin(self) -> tuple[Correction, Mirror]:
         """No correction yet, and the robot's mirror."""
-        env = self._env(2)
+        env = self._env(2, self._calm)
         env.pin_commands(self._limits.T)
         obs = env.get_observations()
         low, high = obs["command"]
@@ -110,53 +112,65 @@ class CorrectionRunner:
         perm, sign = env.mirror["actions"]
         scale = env.robots.action_scale[0, slots].to(low)  # a stiff joint's action is worth a small angle
         scales = self.cfg.task.observations.scales
-        width = len(slots) * (2 * NUM_HARMONICS + 1) + NUM_SHIFTS
+        width, terms = len(slots) * (2 * NUM_HARMONICS + 1) + NUM_SHIFTS, monomials(obs["command"]).shape[1]
         correction = Correction(
-            weights=low.new_zeros(monomials(obs["command"]).shape[1], width),
+            weights=low.new_zeros(0, terms, width),
             slots=slots,
             units=scale.log().mean().exp() / scale,
             middle=(low + high) / 2,
             half_range=(high - low) / 2,
-            gains=low.new_zeros(len(slots), 2 * FEEDBACK_HARMONICS + 1),
+            gains=low.new_zeros(0, len(slots), 2 * FEEDBACK_HARMONICS + 1),
+            harm=low.new_zeros(0, terms),
             yaw_scales=low.new_tensor([scales.base_ang_vel, scales.command[YAW]]),
         )
         partner = (perm[slots].unsqueeze(1) == slots).int().argmax(dim=1)
         return correction, Mirror(command=env.mirror["command"], partner=partner, sign=sign[slots])
 
     def _tune(self, correction: Correction, mirror: Mirror, number: int) -> Correction:
-        """The correction with the gains, downhill of its own, with which commands not probed are followed best."""
-        std = self.cfg.correction.gain_std
+        """The correction with the last gains, downhill of its own, with which commands not probed are followed best."""
+        std, gains = self.cfg.correction.gain_std, correction.gains[-1]
         if not std:
             return correction
-        shape = (self.cfg.correction.num_envs, *correction.gains.shape)
-        change = torch.randn(shape, generator=self._generator(number)).to(correction.gains)
+        shape = (self.cfg.correction.num_envs, *gains.shape)
+        change = torch.randn(shape, generator=self._generator(number)).to(gains)
         change = std * math.sqrt(2.0) * symmetric(change, mirror)  # of which both halves are alike
         more, less = (self._follow(correction, number, gains=way * change) for way in (1.0, -1.0))
         stood = self._require_most(~(more.fell | less.fell))
         downhill = descent(change[stood], 0.5 * (more.cost - less.cost)[stood], mirror)
-        candidates = [replace(correction, gains=correction.gains + length * downhill) for length in (0.0, *LENGTHS)]
+        candidates = [correction.last(gains=gains + length * downhill) for length in (0.0, *LENGTHS)]
         costs = [self._follow(candidate, number + 1).cost.mean().item() for candidate in candidates]
         best = costs.index(min(costs))
         length = (0.0, *LENGTHS)[best]
         self._tell(f"cost {costs[0]:.3f} -> {costs[best]:.3f} with gains changed by {length:g}")
-        return candidates[best] if best else correction
+        return candidates[best]
 
-    def _correct(self, correction: Correction, mirror: Mirror, number: int) -> Correction:
-        """The correction a share of a step further on, if commands that were not probed are followed better there."""
+    def _correct(self, before: Correction, tuned: Correction, mirror: Mirror, number: int) -> Correction:
+        """One pass more than before, with its gains and a share of a step, where commands are followed better with it.
+
+        That is seen at commands that were not probed, half of them in the world of training.
+        """
         correcting = self.cfg.correction
-        step = improve(correction, self._probe(correction, number), mirror, correcting.std, correcting.damping)
-        before = self._follow(correction, number + 1).cost.mean().item()
-        for share in SHARES:
-            candidate = replace(correction, weights=correction.weights + share * step)
-            after = self._follow(candidate, number + 1).cost.mean().item()
-            self._tell(f"cost {before:.3f} -> {after:.3f} with {share:.0%} of the step")
-            if after < before:
-                return candidate
-        return correction
+        step = improve(tuned, self._probe(tuned, number), mirror, correcting.std, correcting.damping)
+        trials = [tuned.last(weights=share * step) for share in SHARES]
+        command, old, *new = self._costs([before, *trials], number + 1)
+        harms = [expected_harm(before, command, cost - old, mirror) for cost in new]
+        basis = monomials(before.normalised(command))
+        changes = [(basis @ harm).clamp(max=0.0).mean().item() for harm in harms]
+        best = changes.index(min(changes))
+        trusted, cost = (basis @ harms[best] < 0).float().mean().item(), old.mean().item()
+        outcome = f"cost {cost:.3f} -> {cost + changes[best]:.3f} with {SHARES[best]:.0%} of the step"
+        self._tell(f"{outcome}, trusted at {trusted:.0%} of the commands")
+        return trials[best].last(harm=harms[best]) if trusted >= MIN_TRUSTED else before
+
+    def _costs(self, corrections: list[Correction], number: int) -> list[Tensor]:
+        """Commands (2 M, 5), and what each correction costs there (2 M,): calm robots, then rough ones."""
+        worlds = ((number, self._calm), (number + 1, self._rough))
+        rollouts = [[self._follow(each, seed, ev=ev) for seed, ev in worlds] for each in corrections]
+        return [torch.cat([r.command for r in rollouts[0]]), *(torch.cat([r.cost for r in both]) for both in rollouts)]
 
     def _probe(self, correction: Correction, number: int) -> Probe:
         """Robots with a change, with its negative and without; those that fell are left out."""
-        shape = (self.cfg.correction.num_envs, correction.weights.shape[1])
+        shape = (self.cfg.correction.num_envs, correction.weights.shape[2])
         change = torch.randn(shape, generator=self._generator(number))
         change = self.cfg.correction.std * change.to(correction.weights)
         more, less, plain = (self._follow(correction, number, way * change) for way in (1.0, -1.0, 0.0))
@@ -174,22 +188,27 @@ class CorrectionRunner:
         return torch.Generator().manual_seed(self.stage.seed + number)
 
     def _tell(self, outcome: str) -> None:
-        Console(stderr=True).print(f"{self.stage.name}: {outcome}", highlight=False)
+        Console(stderr=True).print(f"{self.stage.name}: {outcome}", highlight=False, soft_wrap=True)
 
-    def _env(self, num_envs: int) -> Any:
-        """Environments in the finer physics of evaluation, undisturbed, in the same state every time."""
-        task = evaluation_task(self.cfg.task, self._ev)
+    def _env(self, num_envs: int, ev: EvaluationCfg) -> Any:
+        """Environments in the finer physics of evaluation, in the same state every time."""
+        task = evaluation_task(self.cfg.task, ev)
         return self._make_env(self.cfg.robots, num_envs, task, self.stage.seed)
 
     def _follow(
-        self, correction: Correction, number: int, change: Tensor | float = 0.0, gains: Tensor | float = 0.0
+        self,
+        correction: Correction,
+        number: int,
+        change: Tensor | float = 0.0,
+        gains: Tensor | float = 0.0,
+        ev: EvaluationCfg | None = None,
     ) -> _Rollout:
-        """Let robots follow the commands of this number from rest, with coefficients and gains changed."""
+        """Let robots follow the commands of this number from rest, calm ones or by ``ev``, with something changed."""
         correcting = self.cfg.correction
-        ev = replace(self._ev, seed=self.stage.seed + number)
+        ev = replace(ev or self._calm, seed=self.stage.seed + number)
         drawn = draw_commands(self.cfg.task.commands, ev, self.cfg.robots[0], correcting.num_envs)
         commands = drawn[:, 0].to(self._units)
-        env = self._env(correcting.num_envs)
+        env = self._env(correcting.num_envs, ev)
         env.pin_commands(commands)
         obs = env.get_observations()
         seen = obs["command"]

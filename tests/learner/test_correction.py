@@ -12,10 +12,19 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 from torch import Tensor
 
-from eagle_rl.algorithms.correction import ERROR_HARMONICS, Mirror, Probe, error_waves, improve
+from eagle_rl.algorithms.correction import (
+    ERROR_HARMONICS,
+    MAX_HARM,
+    Mirror,
+    Probe,
+    error_waves,
+    expected_harm,
+    improve,
+)
 from eagle_rl.algorithms.specialists import SpecialistBank
 from eagle_rl.models.actor import ACTOR_INPUTS
 from eagle_rl.models.correction import (
+    DOUBT,
     NUM_HARMONICS,
     NUM_SHIFTS,
     SHIFT_UNIT,
@@ -33,6 +42,8 @@ COMMAND_SIGN = torch.tensor([1.0, -1.0, -1.0, 1.0, 1.0])
 MIRROR = Mirror(command=(torch.arange(5), COMMAND_SIGN), partner=PARTNER, sign=JOINT_SIGN)
 WIDTH = len(SLOTS) * (2 * NUM_HARMONICS + 1) + NUM_SHIFTS
 NUM_ERRORS = 2 * ERROR_HARMONICS + 1
+TERMS = 56
+"""Monomials of five commands up to degree three."""
 
 
 def normal(*shape: int, seed: int = 0) -> Tensor:
@@ -40,17 +51,19 @@ def normal(*shape: int, seed: int = 0) -> Tensor:
 
 
 def correction(weights: Tensor | None = None) -> Correction:
-    """For commands from 1 to 3."""
-    weights = torch.zeros(21, WIDTH) if weights is None else weights
-    return Correction(
-        weights=weights,
+    """One pass, trusted everywhere, for commands from 1 to 3."""
+    weights = torch.zeros(TERMS, WIDTH) if weights is None else weights
+    none = Correction(
+        weights=torch.zeros(0, TERMS, WIDTH),
         slots=SLOTS,
         units=torch.tensor([1.0, 1.0, 0.5]),
         middle=torch.full((5,), 2.0),
         half_range=torch.ones(5),
-        gains=torch.zeros(len(SLOTS), 3),
+        gains=torch.zeros(0, len(SLOTS), 3),
+        harm=torch.zeros(0, TERMS),
         yaw_scales=torch.tensor([0.5, 2.0]),
     )
+    return none.with_pass().last(weights=weights)
 
 
 def even_correction() -> Correction:
@@ -70,11 +83,12 @@ def test_waves_are_the_constant_and_the_harmonics_in_pairs():
     torch.testing.assert_close(waves(torch.tensor([0.25]), 2), torch.tensor([expected]), atol=1e-6, rtol=0)
 
 
-def test_monomials_of_five_commands_go_up_to_degree_two():
+def test_monomials_of_five_commands_go_up_to_degree_three():
     found = monomials(torch.tensor([[2.0, 3.0, 0.0, 0.0, 0.0]]))[0]
     assert found[:3].tolist() == [1.0, 2.0, 3.0]
     assert found[6:8].tolist() == [4.0, 6.0], "v_x v_x, v_x v_y"
-    assert len(found) == 1 + 5 + 15
+    assert found[21:23].tolist() == [8.0, 12.0], "v_x v_x v_x, v_x v_x v_y"
+    assert len(found) == TERMS == 1 + 5 + 15 + 35
 
 
 @given(st.integers(1, ERROR_HARMONICS), st.floats(-2, 2), st.floats(-2, 2), st.floats(-2, 2))
@@ -95,7 +109,7 @@ def test_without_weights_a_policy_acts_as_it_did():
 
 def test_a_joint_gets_its_harmonics_and_nobody_else_does():
     actor, obs = toy()
-    weights = torch.zeros(21, WIDTH)
+    weights = torch.zeros(TERMS, WIDTH)
     weights[0, (2 * NUM_HARMONICS + 1) + 2] = 0.5  # of the second joint, the sine of the phase
     more = correction(weights).act(actor, obs) - actor(obs)
     torch.testing.assert_close(more[:, 2], 0.5 * torch.sin(2 * math.pi * obs["phase"]))
@@ -105,7 +119,7 @@ def test_a_joint_gets_its_harmonics_and_nobody_else_does():
 
 def test_a_coefficient_is_an_angle_where_an_action_is_worth_more_or_less_of_it():
     actor, obs = toy()
-    weights = torch.zeros(21, WIDTH)
+    weights = torch.zeros(TERMS, WIDTH)
     weights[0, 2 * (2 * NUM_HARMONICS + 1)] = 0.5  # of the third joint, the constant; its unit is 0.5
     more = correction(weights).act(actor, obs) - actor(obs)
     torch.testing.assert_close(more[:, 5], torch.full((len(obs),), 0.25))
@@ -113,7 +127,7 @@ def test_a_coefficient_is_an_angle_where_an_action_is_worth_more_or_less_of_it()
 
 def test_a_policy_is_told_more_of_a_velocity_in_shift_units():
     actor, obs = toy()
-    weights = torch.zeros(21, WIDTH)
+    weights = torch.zeros(TERMS, WIDTH)
     weights[0, -NUM_SHIFTS + 1] = 0.1
     told = obs.clone()
     told["command"][:, 1] += 0.1 * SHIFT_UNIT
@@ -125,7 +139,7 @@ def test_a_joint_answers_what_the_robot_turns_too_fast_by_a_gain_that_follows_th
     obs["history"][:, 2], obs["command"][:, 2] = 0.5 * 0.7, 2.0 * 0.3  # turns at 0.7 rad/s, told 0.3 rad/s
     gains = torch.zeros(3, 3)
     gains[1] = torch.tensor([0.5, 0.0, 0.25])
-    more = dataclasses.replace(correction(), gains=gains).act(actor, obs) - actor(obs)
+    more = correction().last(gains=gains).act(actor, obs) - actor(obs)
     torch.testing.assert_close(more[:, 2], 0.4 * (0.5 + 0.25 * torch.sin(2 * math.pi * obs["phase"])))
     more[:, 2] = 0.0
     assert more.abs().max() < 1e-6
@@ -139,20 +153,57 @@ def test_a_joint_answers_what_the_robot_turns_too_fast_by_a_gain_that_follows_th
 def test_a_standing_robot_is_not_corrected():
     actor, obs = toy()
     obs["clock"] = torch.ones_like(obs["clock"])
-    some = dataclasses.replace(correction(normal(21, WIDTH)), gains=normal(3, 3))
+    some = correction(normal(TERMS, WIDTH)).last(gains=normal(3, 3))
     torch.testing.assert_close(some.act(actor, obs), actor(obs))
 
 
 def test_a_standing_robot_is_known_by_the_sines_of_its_feet_whatever_the_harmonics():
     actor, obs = toy(waves=10)
     obs["clock"][:, :2], obs["clock"][:, 2:] = 1.0, -1.0
-    torch.testing.assert_close(correction(normal(21, WIDTH)).act(actor, obs), actor(obs))
+    torch.testing.assert_close(correction(normal(TERMS, WIDTH)).act(actor, obs), actor(obs))
+
+
+def test_passes_add_up_each_where_it_is_trusted():
+    """The first helps where v_x is large, the second where it is small, both by far more than doubt."""
+    first, second = normal(2, TERMS, WIDTH)
+    harm = torch.zeros(2, TERMS)
+    harm[:, 1] = torch.tensor([-20.0, 20.0]) * DOUBT
+    both = correction(first).last(harm=harm[0], gains=torch.ones(3, 3)).with_pass().last(weights=second, harm=harm[1])
+    small, large = torch.full((1, 5), 1.0), torch.full((1, 5), 3.0)
+    for command, weights, gain in ((large, first, 1.0), (small, second, 0.0)):
+        coefficients, gains = both.at(command)
+        torch.testing.assert_close(coefficients, correction(weights).at(command)[0], atol=1e-5, rtol=0)
+        torch.testing.assert_close(gains, torch.full((1, 3, 3), gain), atol=1e-6, rtol=0)
+
+
+def test_before_its_first_pass_and_with_an_empty_one_a_correction_adds_nothing():
+    none = dataclasses.replace(correction(), **{n: getattr(correction(), n)[:0] for n in ("weights", "gains", "harm")})
+    for each in (none, none.with_pass()):
+        assert not any(x.any() for x in each.at(normal(4, 5)))
+
+
+def test_harm_is_expected_where_it_was_seen_at_mirrored_commands_too():
+    command = 2 * torch.rand(400, 5, generator=torch.Generator().manual_seed(1)) - 1
+    harm = 0.5 * command[:, 0] * command[:, 1].abs() - 0.1
+    expected = expected_harm(even_correction(), command, harm, MIRROR)
+    corners = torch.tensor([[1.0, 0.9, 0, 0, 0], [1.0, -0.9, 0, 0, 0], [-1.0, 0.9, 0, 0, 0]])
+    found = monomials(corners) @ expected
+    assert (found[:2] > 0.2).all(), found
+    assert found[2] < -0.3, found
+    torch.testing.assert_close(found[0], found[1], msg="left and right are alike")
+
+
+def test_one_that_falls_does_not_outvote_all_others():
+    command, harm = torch.zeros(50, 5), torch.full((50,), -0.3)
+    harm[0] = 14.0
+    expected = expected_harm(even_correction(), command, harm, MIRROR)[0].item()
+    assert expected == pytest.approx((49 * -0.3 + MAX_HARM) / 50, abs=0.01)
 
 
 def test_beyond_the_commands_it_was_made_for_a_correction_stays_what_it_is_at_their_end():
-    some = correction(normal(21, WIDTH))
+    some = correction(normal(TERMS, WIDTH))
     ends, beyond = torch.tensor([[1.0, 3.0, 2.0, 3.0, 1.0]]), torch.tensor([[-9.0, 9.0, 2.0, 4.0, 0.0]])
-    torch.testing.assert_close(some.coefficients(beyond), some.coefficients(ends))
+    torch.testing.assert_close(some.at(beyond), some.at(ends))
 
 
 def test_the_mirror_image_of_a_mirror_image_is_the_probe():
@@ -174,13 +225,13 @@ def test_half_a_cycle_later_the_other_side_does_the_same():
 
 
 def linear_world(seed: int = 0) -> tuple[Tensor, Tensor]:
-    """Errors as polynomials of the command, (21, 5 B), and how they answer to a change, (C, 5 B).
+    """Errors as polynomials of the command, (56, 5 B), and how they answer to a change, (C, 5 B).
 
     Both are their own mirror images, as those of a robot are.
     """
     sign = (COMMAND_SIGN.unsqueeze(1) * half_cycle()).flatten()
     odd = monomials(COMMAND_SIGN.unsqueeze(0))[0]
-    errors = normal(21, 5 * NUM_ERRORS, seed=seed) * (odd.unsqueeze(1) == sign)
+    errors = normal(TERMS, 5 * NUM_ERRORS, seed=seed) * (odd.unsqueeze(1) == sign)
     answer = normal(WIDTH, 5 * NUM_ERRORS, seed=seed + 1)
     images = [
         MIRROR.both(
@@ -235,7 +286,7 @@ def test_damping_makes_steps_smaller_and_never_makes_errors_larger(seed):
 
 def test_specialists_label_what_they_do_with_their_correction():
     actor, obs = toy()
-    some = correction(0.1 * normal(21, WIDTH))
+    some = correction(0.1 * normal(TERMS, WIDTH))
     bank = SpecialistBank([actor] * 3, [None, some, None])
     labels = bank.label(obs.unsqueeze(0))["teacher_action"][0]
     corrected = obs["robot"] == 1
@@ -247,5 +298,5 @@ def test_a_correction_reads_what_policies_read_and_the_phase():
     actor, obs = toy()
     groups = (*ACTOR_INPUTS, "slot_mask", "phase")
     alone = TensorDict({name: obs[name] for name in groups}, batch_size=obs.batch_size)
-    some = correction(normal(21, WIDTH))
+    some = correction(normal(TERMS, WIDTH))
     torch.testing.assert_close(some.act(actor, alone), some.act(actor, obs))

@@ -34,6 +34,7 @@ SEARCH = "eagle_rl/algorithms/search.py"
 SEARCHING = "eagle_rl/runners/searching.py"
 CORRECTION = "eagle_rl/models/correction.py"
 CORRECTING = "eagle_rl/algorithms/correction.py"
+CORRECTING_RUNNER = "eagle_rl/runners/correcting.py"
 FEEDBACK = "eagle_rl/algorithms/feedback.py"
 TRIALS = "eagle_rl/evaluation/trials.py"
 LOSSES = "eagle_rl/algorithms/losses.py"
@@ -213,9 +214,7 @@ MUTANTS: tuple[Mutant, ...] = (
     Mutant(CORRECTION, "self.yaw_scales[0] - command", "self.yaw_scales[0] + command", "learner/test_correction.py"),
     Mutant(FEEDBACK, "turned = -half_a_cycle", "turned = half_a_cycle", "learner/test_feedback.py"),
     Mutant(FEEDBACK, "downhill = -symmetric", "downhill = symmetric", "learner/test_feedback.py"),
-    Mutant(
-        "eagle_rl/runners/correcting.py", "0.5 * (more.cost - less.cost)", "more.cost", "runners/test_correcting.py"
-    ),
+    Mutant(CORRECTING_RUNNER, "0.5 * (more.cost - less.cost)", "more.cost", "runners/test_correcting.py"),
     Mutant(
         "eagle_rl/runners/root.py", "pad(weights, (0, columns))", "pad(weights, (columns, 0))", "runners/test_root.py"
     ),
@@ -224,10 +223,14 @@ MUTANTS: tuple[Mutant, ...] = (
     Mutant(
         CORRECTING, "* half_a_cycle(NUM_HARMONICS)", "* waves(sign, NUM_HARMONICS)[0]", "learner/test_correction.py"
     ),
+    Mutant(CORRECTION, "/ -DOUBT", "/ DOUBT", "learner/test_correction.py"),
+    Mutant(CORRECTING, "command[:, perm] * sign)))", "command[:, perm])))", "learner/test_correction.py"),
+    Mutant(CORRECTING, "harm.clamp(-MAX_HARM, MAX_HARM)", "harm", "learner/test_correction.py"),
+    Mutant(CORRECTING_RUNNER, "cost - old, mirror", "old - cost, mirror", "runners/test_correcting.py"),
     Mutant(CORRECTING, "return -effect @", "return effect @", "learner/test_correction.py"),
     Mutant(CORRECTING, "found[..., 1:] *= ", "found[..., 2:] *= ", "learner/test_correction.py"),
     Mutant(
-        "eagle_rl/runners/correcting.py",
+        CORRECTING_RUNNER,
         "0.5 * (more.waves - less.waves)",
         "0.5 * (less.waves - more.waves)",
         "runners/test_correcting.py",
