@@ -61,7 +61,7 @@ check: $(INSTALLED)
 
 POLICY := checkpoints/generalist
 RESULTS := docs/results
-EVALUATE = $(BIN)/eagle evaluate "Kickstarting=$(POLICY).safetensors" --envs $(RESULT_ENVS)
+EVALUATE = $(BIN)/eagle evaluate "EAGLE=$(POLICY).safetensors" --envs $(RESULT_ENVS)
 PLOT = $(BIN)/eagle plot
 # Policies whose embeddings are compared: make results LATENTS="with=A without=B"
 LATENTS ?= $(POLICY).safetensors
