@@ -158,7 +158,7 @@ class CorrectionRunner:
         changes = [(basis @ harm).clamp(max=0.0).mean().item() for harm in harms]
         best = changes.index(min(changes))
         trusted, cost = (basis @ harms[best] < 0).float().mean().item(), old.mean().item()
-        outcome = f"cost {cost:.3f} -> {cost + changes[best]:.3f} with {SHARES[best]:.0%} of the step"
+        outcome = f"cost {cost:.3f} -> {cost + changes[best]:.3f} expected with {SHARES[best]:.0%} of the step"
         self._tell(f"{outcome}, trusted at {trusted:.0%} of the commands")
         return trials[best].last(harm=harms[best]) if trusted >= MIN_TRUSTED else before
 
