@@ -196,6 +196,8 @@ class CorrectionCfg:
     """The first of them, which are not looked at."""
     gain_std: float = 0.03
     """Of the changes tried of every gain by which a joint answers the yaw rate's error [s/rad]; 0 tunes none."""
+    foresight_std: float = 0.05
+    """Of the noise on every action from which foresight of errors is learned, in the unit of ``std``; 0 for none."""
     std: float = 0.03
     """Of the changes tried for every joint and harmonic [-]; 1 is an angle, an action's in the geometric mean."""
     damping: float = 6.0

@@ -1,12 +1,12 @@
 """A policy with a correction: what is added to its command and its action.
 
-A part of it depends on command and phase alone; a smaller one answers the error of the yaw rate. It is made in passes,
-each of which is trusted where it was seen to help.
+A part of it depends on command and phase alone; a smaller one answers the error of the yaw rate. These are made in
+passes, each of which is trusted where it was seen to help. On top comes what errors that are foreseen ask for.
 """
 
 from __future__ import annotations
 
-import math
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from itertools import combinations_with_replacement
 
@@ -15,6 +15,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from eagle_rl.models.actor import ACTOR_INPUTS, EagleActor
+from eagle_rl.models.foresight import Foresight, waves
 
 NUM_HARMONICS = 5
 """Highest multiple of the gait's frequency that is added to an action; 50 Hz make 20 to 25 steps of a cycle."""
@@ -35,6 +36,8 @@ DEGREE = 3
 """Of the polynomials of the command."""
 DOUBT = 0.05
 """Harm, and help, within which trust passes from nearly all to nearly nothing [error units]."""
+_FORESIGHT = "foresight."
+"""What the names of its tensors begin with."""
 TRUSTED = -1.0
 """Harm expected of a new pass at every command, until something is known about it [error units]."""
 
@@ -42,13 +45,6 @@ TRUSTED = -1.0
 def half_a_cycle(num_harmonics: int) -> Tensor:
     """What half a cycle does to the coefficients of :func:`waves`, shape (2 num_harmonics + 1,)."""
     return (-1.0) ** torch.tensor([0, *(k for k in range(1, num_harmonics + 1) for _ in range(2))])
-
-
-def waves(phase: Tensor, num_harmonics: int) -> Tensor:
-    """1, cos 2 pi phi, sin 2 pi phi, cos 4 pi phi, ... of phases (...) [cycles], shape (..., 2 num_harmonics + 1)."""
-    angle = 2.0 * math.pi * phase.unsqueeze(-1) * torch.arange(1, num_harmonics + 1, device=phase.device)
-    both = torch.stack((torch.cos(angle), torch.sin(angle)), dim=-1).flatten(-2)
-    return torch.cat((torch.ones_like(phase).unsqueeze(-1), both), dim=-1)
 
 
 def monomials(x: Tensor) -> Tensor:
@@ -81,6 +77,8 @@ class Correction:
     """Weights of the monomials: by how much a pass makes following worse [error units], shape (I, 56)."""
     yaw_scales: Tensor
     """Of the yaw rate and of its command in the observations, shape (2,)."""
+    foresight: Foresight | None = None
+    """Answers errors that are about to come."""
 
     def normalised(self, command: Tensor) -> Tensor:
         """Scaled commands (N, 5) as shares of their ranges, in [-1, 1]; beyond these a polynomial would run away."""
@@ -106,14 +104,20 @@ class Correction:
 
     def last(self, **fields: Tensor) -> Correction:
         """The same with other ``weights``, ``gains`` or ``harm`` of the last pass."""
-        return replace(self, **{name: torch.cat((getattr(self, name)[:-1], x[None])) for name, x in fields.items()})
+        changed = {name: torch.cat((getattr(self, name)[:-1], x[None])) for name, x in fields.items()}
+        return replace(self, **changed)  # type: ignore[arg-type]  # of tensors, which no foresight is
 
     def yaw_error(self, history: Tensor, command: Tensor) -> Tensor:
         """How much faster the robot turns than it is told to, as its gyroscope says [rad/s], shape (N,)."""
         return history[:, YAW] / self.yaw_scales[0] - command[:, YAW] / self.yaw_scales[1]
 
     def act(
-        self, actor: EagleActor, obs: TensorDict, extra: Tensor | float = 0.0, extra_gains: Tensor | float = 0.0
+        self,
+        actor: EagleActor,
+        obs: TensorDict,
+        extra: Tensor | float = 0.0,
+        extra_gains: Tensor | float = 0.0,
+        extra_actions: Tensor | float = 0.0,
     ) -> Tensor:
         """Mean actions (N, 32) of the corrected policy.
 
@@ -122,6 +126,7 @@ class Correction:
             obs: the groups it reads, ``slot_mask`` and ``phase``.
             extra: added to the coefficients, the same shape.
             extra_gains: added to the gains, shape (N, S, 2 FEEDBACK_HARMONICS + 1).
+            extra_actions: added to the actions, in units, shape (N, S).
         """
         history, command, clock = (obs[group] for group in ACTOR_INPUTS)
         walks = clock[:, :NUM_FEET].amin(dim=1, keepdim=True) < STANDING_CLOCK
@@ -134,12 +139,28 @@ class Correction:
         waving = waves(obs["phase"], NUM_HARMONICS).unsqueeze(1)
         more = (by_joint * waving).sum(dim=2)
         gain = ((gains + extra_gains) * waving[..., : gains.shape[2]]).sum(dim=2)
-        more += gain * self.yaw_error(history, command).unsqueeze(1) * walks
+        more += (gain * self.yaw_error(history, command).unsqueeze(1) + extra_actions) * walks
+        if self.foresight is not None:
+            basis = monomials(self.normalised(command))
+            more += self.foresight.change(history, obs["phase"], basis) * walks
         return actions.index_add(1, self.slots, self.units * more)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Arguments of the constructor."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
+        """Arguments of the constructor, and those of the foresight's with its name before theirs."""
+        own = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "foresight"}
+        ahead = self.foresight.state_dict() if self.foresight else {}
+        return own | {f"{_FORESIGHT}{name}": x for name, x in ahead.items()}
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Tensor]) -> Correction:
+        """What :meth:`state_dict` was made of.
+
+        Raises:
+            TypeError: names are missing, or others are there.
+        """
+        own = {name: x for name, x in state.items() if not name.startswith(_FORESIGHT)}
+        ahead = {name.removeprefix(_FORESIGHT): x for name, x in state.items() if name not in own}
+        return cls(**own, foresight=Foresight(**ahead) if ahead else None)
 
 
 class CorrectedPolicy:

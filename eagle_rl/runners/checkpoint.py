@@ -146,7 +146,7 @@ def load_correction(path: Path, device: str | torch.device = "cpu") -> Correctio
     else:
         saved = load_checkpoint(path).state.get("correction", {})
     try:
-        return Correction(**{name: x.to(device) for name, x in saved.items()}) if saved else None
+        return Correction.from_state({name: x.to(device) for name, x in saved.items()}) if saved else None
     except TypeError as error:
         raise CheckpointError(f"{path}: holds a correction of another version: {error}. Correct it again.") from error
 

@@ -6,23 +6,30 @@ import math
 import time
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import torch
 from rich.console import Console
 from torch import Tensor
 
-from eagle_rl.algorithms.correction import Mirror, Probe, error_waves, expected_harm, improve
+from eagle_rl.algorithms.correction import Mirror, Probe, expected_harm, improve
 from eagle_rl.algorithms.feedback import descent, symmetric
-from eagle_rl.config.schema import EvaluationCfg, ExperimentCfg
+from eagle_rl.algorithms.foresight import foresee
+from eagle_rl.config.schema import ExperimentCfg
 from eagle_rl.errors import EagleWarning
 from eagle_rl.evaluation.evaluate import MakeEnv
-from eagle_rl.evaluation.protocol import COMMANDS, draw_commands, evaluation_task
-from eagle_rl.models.correction import FEEDBACK_HARMONICS, NUM_HARMONICS, NUM_SHIFTS, YAW, Correction, monomials
+from eagle_rl.models.correction import (
+    FEEDBACK_HARMONICS,
+    NUM_HARMONICS,
+    NUM_SHIFTS,
+    YAW,
+    Correction,
+    monomials,
+)
 from eagle_rl.runners import checkpoint as ckpt
 from eagle_rl.runners.files import patiently
+from eagle_rl.runners.following import Followers
 from eagle_rl.runners.plan import Stage
 from eagle_rl.runners.provenance import Provenance
 
@@ -30,6 +37,8 @@ SHARES = (1.0, 0.5)
 """Of a step that are tried: after a whole one a robot may fall."""
 LENGTHS = (0.8, 0.4, 0.2, 0.1)
 """Changes of all gains together that are tried [s/rad]; the best of them is taken, beyond it the loop rings."""
+DAMPINGS = (56.0, 28.0, 20.0, 14.0)
+"""Of the foresight's answer that are tried; with 5 robots fall (docs/experiments.md, 26)."""
 MIN_TRUSTED = 0.1
 """Share of the commands a pass must help at; with less it may well be chance that it seems to."""
 MIN_SURVIVAL = 0.25
@@ -38,20 +47,6 @@ MIN_SURVIVAL = 0.25
 
 class _TooFewStoodError(Exception):
     """Nothing can be learned of robots that fall."""
-
-
-@dataclass(frozen=True)
-class _Rollout:
-    """What came of M robots."""
-
-    command: Tensor
-    """As the policy saw it, shape (M, 5)."""
-    waves: Tensor
-    """Of the errors in multiples of their units, shape (M, 5, B)."""
-    cost: Tensor
-    """Mean error in multiples of the units, of who falls that of the largest commands there are, shape (M,)."""
-    fell: Tensor
-    """Bool, shape (M,)."""
 
 
 class CorrectionRunner:
@@ -65,19 +60,9 @@ class CorrectionRunner:
     ) -> None:
         """Take the learner of ``init``; write into ``folder``."""
         self.cfg, self.stage, self.folder, self.provenance = cfg, stage, folder, provenance
-        self._make_env = make_env
         self._learner = ckpt.load_checkpoint(init, provenance.slot_table_hash).state
-        self._actor = ckpt.load_actor(init, cfg.run.env_device)[0]
-        fine = cfg.evaluation  # footfalls ring on otherwise at other steps, and so does what answers them
-        self._calm = EvaluationCfg(
-            num_steps=cfg.correction.num_steps, physics_dt=fine.physics_dt, decimation=fine.decimation
-        )
-        self._rough = replace(self._calm, randomization=True, noise=True)
-        self._units = torch.tensor(cfg.search.error_units, device=cfg.run.env_device)
-        self._limits = torch.tensor(
-            [getattr(cfg.task.commands, name).finishing for name in COMMANDS], device=cfg.run.env_device
-        )
-        self.env_steps = 0
+        actor = ckpt.load_actor(init, cfg.run.env_device)[0]
+        self._robots = Followers(cfg, actor, make_env, stage.seed)
 
     @torch.no_grad()
     def run(self, on_iteration: Callable[[], None] = lambda: None) -> Path:
@@ -100,12 +85,13 @@ class CorrectionRunner:
             on_iteration()
             if correction is before:
                 break
+        correction = self._foresee(correction, mirror, 5 * self.stage.iterations)
         return patiently(lambda: self._save(correction, time.perf_counter() - start))
 
     def _begin(self) -> tuple[Correction, Mirror]:
         """No correction yet, and the robot's mirror."""
-        env = self._env(2, self._calm)
-        env.pin_commands(self._limits.T)
+        env = self._robots.env(2, self._robots.calm)
+        env.pin_commands(self._robots.limits.T)
         obs = env.get_observations()
         low, high = obs["command"]
         slots = obs["slot_mask"][0].nonzero().flatten()
@@ -132,13 +118,13 @@ class CorrectionRunner:
         if not std:
             return correction
         shape = (self.cfg.correction.num_envs, *gains.shape)
-        change = torch.randn(shape, generator=self._generator(number)).to(gains)
+        change = torch.randn(shape, generator=self._robots.generator(number)).to(gains)
         change = std * math.sqrt(2.0) * symmetric(change, mirror)  # of which both halves are alike
-        more, less = (self._follow(correction, number, gains=way * change) for way in (1.0, -1.0))
+        more, less = (self._robots.follow(correction, number, gains=way * change) for way in (1.0, -1.0))
         stood = self._require_most(~(more.fell | less.fell))
         downhill = descent(change[stood], 0.5 * (more.cost - less.cost)[stood], mirror)
         candidates = [correction.last(gains=gains + length * downhill) for length in (0.0, *LENGTHS)]
-        costs = [self._follow(candidate, number + 1).cost.mean().item() for candidate in candidates]
+        costs = [self._robots.follow(candidate, number + 1).cost.mean().item() for candidate in candidates]
         best = costs.index(min(costs))
         length = (0.0, *LENGTHS)[best]
         self._tell(f"cost {costs[0]:.3f} -> {costs[best]:.3f} with gains changed by {length:g}")
@@ -162,18 +148,37 @@ class CorrectionRunner:
         self._tell(f"{outcome}, trusted at {trusted:.0%} of the commands")
         return trials[best].last(harm=harms[best]) if trusted >= MIN_TRUSTED else before
 
+    def _foresee(self, correction: Correction, mirror: Mirror, number: int) -> Correction:
+        """The correction with a foresight, learned in both worlds and damped as it helps most in both, if it does."""
+        std = self.cfg.correction.foresight_std
+        if not std:
+            return correction
+        worlds = ((number, self._robots.calm), (number + 1, self._robots.rough))
+        traces = [self._robots.disturbed(correction, seed, ev) for seed, ev in worlds]
+        if not any(trace.command.numel() for trace in traces):
+            return correction
+        history = self._robots.env(2, self._robots.calm).mirror["history"]
+        found = foresee([*traces, *(trace.mirrored(mirror, history) for trace in traces)], DAMPINGS[0])
+        damped = [replace(found, damping=found.damping.new_tensor(damping)) for damping in DAMPINGS]
+        candidates = [correction, *(replace(correction, foresight=foresight) for foresight in damped)]
+        costs = [cost.mean().item() for cost in self._costs(candidates, number + 2)[1:]]
+        best = costs.index(min(costs))
+        how = f"damped by {DAMPINGS[best - 1]:g}" if best else "left out"
+        self._tell(f"cost {costs[0]:.3f} -> {costs[best]:.3f} with foresight {how}")
+        return candidates[best]
+
     def _costs(self, corrections: list[Correction], number: int) -> list[Tensor]:
         """Commands (2 M, 5), and what each correction costs there (2 M,): calm robots, then rough ones."""
-        worlds = ((number, self._calm), (number + 1, self._rough))
-        rollouts = [[self._follow(each, seed, ev=ev) for seed, ev in worlds] for each in corrections]
+        worlds = ((number, self._robots.calm), (number + 1, self._robots.rough))
+        rollouts = [[self._robots.follow(each, seed, ev=ev) for seed, ev in worlds] for each in corrections]
         return [torch.cat([r.command for r in rollouts[0]]), *(torch.cat([r.cost for r in both]) for both in rollouts)]
 
     def _probe(self, correction: Correction, number: int) -> Probe:
         """Robots with a change, with its negative and without; those that fell are left out."""
         shape = (self.cfg.correction.num_envs, correction.weights.shape[2])
-        change = torch.randn(shape, generator=self._generator(number))
+        change = torch.randn(shape, generator=self._robots.generator(number))
         change = self.cfg.correction.std * change.to(correction.weights)
-        more, less, plain = (self._follow(correction, number, way * change) for way in (1.0, -1.0, 0.0))
+        more, less, plain = (self._robots.follow(correction, number, way * change) for way in (1.0, -1.0, 0.0))
         answer = 0.5 * (more.waves - less.waves)
         probe = Probe(command=plain.command, change=change, answer=answer, error=plain.waves)
         return probe.of(self._require_most(~(more.fell | less.fell | plain.fell)))
@@ -184,53 +189,14 @@ class CorrectionRunner:
             raise _TooFewStoodError
         return stood
 
-    def _generator(self, number: int) -> torch.Generator:
-        return torch.Generator().manual_seed(self.stage.seed + number)
-
     def _tell(self, outcome: str) -> None:
         Console(stderr=True).print(f"{self.stage.name}: {outcome}", highlight=False, soft_wrap=True)
-
-    def _env(self, num_envs: int, ev: EvaluationCfg) -> Any:
-        """Environments in the finer physics of evaluation, in the same state every time."""
-        task = evaluation_task(self.cfg.task, ev)
-        return self._make_env(self.cfg.robots, num_envs, task, self.stage.seed)
-
-    def _follow(
-        self,
-        correction: Correction,
-        number: int,
-        change: Tensor | float = 0.0,
-        gains: Tensor | float = 0.0,
-        ev: EvaluationCfg | None = None,
-    ) -> _Rollout:
-        """Let robots follow the commands of this number from rest, calm ones or by ``ev``, with something changed."""
-        correcting = self.cfg.correction
-        ev = replace(ev or self._calm, seed=self.stage.seed + number)
-        drawn = draw_commands(self.cfg.task.commands, ev, self.cfg.robots[0], correcting.num_envs)
-        commands = drawn[:, 0].to(self._units)
-        env = self._env(correcting.num_envs, ev)
-        env.pin_commands(commands)
-        obs = env.get_observations()
-        seen = obs["command"]
-        fell = torch.zeros(len(commands), dtype=torch.bool, device=commands.device)
-        errors, phases = [], []
-        for _ in range(correcting.num_steps):
-            obs, _, dones, extras = env.step(correction.act(self._actor, obs, change, gains))
-            fell |= dones.bool() & ~extras["time_outs"].bool()
-            errors.append((env.measured_commands().to(commands) - commands) / self._units)
-            phases.append(obs["phase"])
-        self.env_steps += len(commands) * correcting.num_steps
-        signed = torch.stack(errors)[correcting.settling_steps :]
-        worst = (self._limits.abs().amax(dim=1) / self._units).mean()
-        cost = torch.where(fell, worst, signed.abs().mean(dim=(0, 2)))
-        found = error_waves(signed, torch.stack(phases)[correcting.settling_steps :])
-        return _Rollout(command=seen, waves=found, cost=cost, fell=fell)
 
     def _save(self, correction: Correction, seconds: float) -> Path:
         """Write a checkpoint that other stages start from as from any other."""
         iterations = self.stage.iterations
         state = self._learner | {
-            "runner": {"next_iteration": iterations, "env_steps": self.env_steps, "wall_time": seconds},
+            "runner": {"next_iteration": iterations, "env_steps": self._robots.env_steps, "wall_time": seconds},
             "correction": correction.state_dict(),
         }
         return ckpt.save_checkpoint(
@@ -238,6 +204,6 @@ class CorrectionRunner:
             state,
             self.provenance,
             iteration=iterations,
-            env_steps=self.env_steps,
+            env_steps=self._robots.env_steps,
             stage_end=True,
         )

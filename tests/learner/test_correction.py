@@ -31,8 +31,8 @@ from eagle_rl.models.correction import (
     CorrectedPolicy,
     Correction,
     monomials,
-    waves,
 )
+from eagle_rl.models.foresight import waves
 from tests.learner.helpers import make_runner
 from tests.toy import ToyEnv
 

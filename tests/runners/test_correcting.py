@@ -25,6 +25,8 @@ CORRECTION = CorrectionCfg(num_envs=64, num_steps=12, settling_steps=2, damping=
 ROLLOUT = 64 * 12
 PROBE = 3 * ROLLOUT
 """Environment steps of a probe; six looks follow it, and gains take seven rollouts before it."""
+FORESIGHT = (2 + 2 * (1 + len(correcting.DAMPINGS))) * ROLLOUT
+"""Environment steps of a foresight: two worlds to learn from, two to see every damping in."""
 
 
 def corrected(folder: Path, probes: int = 2, **changes: float) -> tuple[ExperimentCfg, RunResult]:
@@ -58,16 +60,48 @@ def test_a_correction_makes_robots_follow_better_and_leaves_the_network_alone(tm
 def test_its_steps_are_counted(tmp_path):
     _, result = corrected(tmp_path, probes=1)
     spent = result.records["round1/correct_one"].env_steps
-    assert spent == (7 + 3 + 6) * ROLLOUT
+    assert spent == (7 + 3 + 6) * ROLLOUT + FORESIGHT
 
 
 def test_no_gains_are_tuned_where_none_are_to_be_tried(tmp_path):
     _, result = corrected(tmp_path, probes=1, gain_std=0.0)
     record = result.records["round1/correct_one"]
-    assert record.env_steps == (3 + 6) * ROLLOUT
+    assert record.env_steps == (3 + 6) * ROLLOUT + FORESIGHT
     saved = load_correction(final_checkpoint(result.run_dir, "round1/correct_one"))
     assert saved is not None
     assert not saved.gains.any()
+
+
+def test_what_is_foreseen_is_answered_on_top_of_all_passes(tmp_path):
+    """The toys' errors follow from their joints, which a history shows; passes know the command alone."""
+    results = {std: corrected(tmp_path / str(std), probes=1, foresight_std=std)[1].run_dir for std in (0.0, 0.05)}
+    for robot in ("two", "three"):
+        paths = {std: final_checkpoint(run, f"round1/correct_{robot}") for std, run in results.items()}
+        actor = load_actor(paths[0.0])[0]
+        without, foreseeing = load_correction(paths[0.0]), load_correction(paths[0.05])
+        assert without is not None
+        assert without.foresight is None
+        assert foreseeing is not None
+        assert foreseeing.foresight is not None, robot
+        torch.testing.assert_close(foreseeing.weights, without.weights, msg="it comes after them")
+        before, after = (errors(CorrectedPolicy(actor, each), robot) for each in (without, foreseeing))
+        assert after < 0.95 * before, robot
+
+
+def test_a_foresight_that_makes_nothing_better_is_left_out(tmp_path, monkeypatch, capsys):
+    foresee = correcting.foresee
+
+    def wrong(*args):
+        found = foresee(*args)
+        return dataclasses.replace(found, weights=-3.0 * found.weights)
+
+    monkeypatch.setattr(correcting, "foresee", wrong)
+    _, result = corrected(tmp_path, probes=1)
+    for robot in ("one", "two", "three"):
+        saved = load_correction(final_checkpoint(result.run_dir, f"round1/correct_{robot}"))
+        assert saved is not None
+        assert saved.foresight is None, robot
+    assert "with foresight left out" in capsys.readouterr().err
 
 
 class SpinningToyEnv(StillToyEnv):
