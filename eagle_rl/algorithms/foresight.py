@@ -10,7 +10,7 @@ from torch import Tensor
 
 from eagle_rl.algorithms.correction import Mirror
 from eagle_rl.models.correction import monomials
-from eagle_rl.models.foresight import ANSWER_HARMONICS, HORIZON, Foresight, products, waves
+from eagle_rl.models.foresight import ANSWER_HARMONICS, Foresight, products, waves
 
 RIDGE = 1e-4
 """Of the regression, in multiples of the number of samples."""
@@ -55,11 +55,12 @@ class Trace:
         )
 
 
-def foresee(traces: Iterable[Trace], damping: float) -> Foresight:
+def foresee(traces: Iterable[Trace], horizon: int, damping: float) -> Foresight:
     """Fit the errors of the next steps to what is seen before them and to what is added to the action.
 
     Args:
         traces: of as many worlds as it is to hold in; noise that is in them is not answered.
+        horizon: steps that are looked ahead.
         damping: of the answer.
     """
     traces = list(traces)
@@ -68,7 +69,7 @@ def foresee(traces: Iterable[Trace], damping: float) -> Foresight:
     columns = (std > 1e-6).nonzero().flatten()
     blank = seen.new_zeros(0)
     looks = Foresight(columns, mean[columns], std[columns], blank, blank, seen.new_tensor(damping))
-    normal, right, count = _normal_equations(looks, traces)
+    normal, right, count = _normal_equations(looks, traces, horizon)
     normal.diagonal().add_(RIDGE * count)
     solution = torch.linalg.solve(normal.double(), right.double()).to(right)
     num_joints = traces[0].change.shape[2]
@@ -77,12 +78,12 @@ def foresee(traces: Iterable[Trace], damping: float) -> Foresight:
     return Foresight(columns, looks.mean, looks.scale, solution[:-answered], answer, looks.damping)
 
 
-def _normal_equations(looks: Foresight, traces: list[Trace]) -> tuple[Tensor, Tensor, int]:
-    """Sums of products of regressors (R, R), of regressors and errors ahead (R, 5 HORIZON), and their number."""
+def _normal_equations(looks: Foresight, traces: list[Trace], horizon: int) -> tuple[Tensor, Tensor, int]:
+    """Sums of products of regressors (R, R), of regressors and errors ahead (R, 5 horizon), and their number."""
     normal, right, count = torch.zeros(()), torch.zeros(()), 0
     for trace in traces:
-        steps = len(trace.phase) - HORIZON + 1
-        ahead = torch.cat([trace.error[h : h + steps] for h in range(HORIZON)], dim=2)
+        steps = len(trace.phase) - horizon + 1
+        ahead = torch.cat([trace.error[h : h + steps] for h in range(horizon)], dim=2)
         for some in torch.arange(steps).split(STEPS_AT_ONCE):
             phase = trace.phase[some]
             basis = monomials(trace.command).expand(len(some), -1, -1)

@@ -198,6 +198,8 @@ class CorrectionCfg:
     """Of the changes tried of every gain by which a joint answers the yaw rate's error [s/rad]; 0 tunes none."""
     foresight_std: float = 0.05
     """Of the noise on every action from which foresight of errors is learned, in the unit of ``std``; 0 for none."""
+    foresight_steps: int = 5
+    """Control steps that are looked ahead."""
     std: float = 0.03
     """Of the changes tried for every joint and harmonic [-]; 1 is an angle, an action's in the geometric mean."""
     damping: float = 6.0

@@ -19,8 +19,6 @@ HISTORY_HARMONICS = 1
 """Of the gait, by which the weights of the history may vary."""
 ANSWER_HARMONICS = 2
 """Of the gait, by which the answer to a change of the action may vary."""
-HORIZON = 5
-"""Control steps that are looked ahead."""
 MAX_DEVIATION = 5.0
 """Of an entry of the history, beyond which it counts no more [standard deviations]."""
 MAX_CHANGE = 0.5
@@ -41,7 +39,7 @@ def products(a: Tensor, b: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Foresight:
-    """Prediction and answer of one robot; F features, Z = 5 HORIZON errors ahead, S joints."""
+    """Prediction and answer of one robot; F features, Z errors ahead (five of each step), S joints."""
 
     columns: Tensor
     """Of the history that are looked at, shape (G,)."""

@@ -158,7 +158,8 @@ class CorrectionRunner:
         if not any(trace.command.numel() for trace in traces):
             return correction
         history = self._robots.env(2, self._robots.calm).mirror["history"]
-        found = foresee([*traces, *(trace.mirrored(mirror, history) for trace in traces)], DAMPINGS[0])
+        both_sides = [*traces, *(trace.mirrored(mirror, history) for trace in traces)]
+        found = foresee(both_sides, self.cfg.correction.foresight_steps, DAMPINGS[0])
         damped = [replace(found, damping=found.damping.new_tensor(damping)) for damping in DAMPINGS]
         candidates = [correction, *(replace(correction, foresight=foresight) for foresight in damped)]
         costs = [cost.mean().item() for cost in self._costs(candidates, number + 2)[1:]]

@@ -172,6 +172,7 @@ def test_a_wrong_override_is_named_with_what_was_expected(override, expected):
         ("robots=[]", "robots: expected at least one robot"),
         ("robots=[h1, g1, h1]", "named twice: h1"),
         ("plan.method=eagle", "needs a budget for this stage"),
+        ("correction.num_steps=64", "correction.num_steps: got 64, expected 65 or more, to look ahead"),
         ("search.num_steps=40", "search.num_steps: got 40, expected more than search.settling_steps, 40"),
         ("search.error_units=[0.05, 0.08, 0, 0.02, 0.04]", "expected numbers above 0"),
         ("run.device=tpu", "expected cpu, cuda or cuda:N"),

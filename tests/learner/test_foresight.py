@@ -10,10 +10,11 @@ from torch import Tensor
 
 from eagle_rl.algorithms.foresight import Trace, foresee
 from eagle_rl.models.correction import CorrectedPolicy, Correction, monomials
-from eagle_rl.models.foresight import HORIZON, MAX_CHANGE, Foresight, products, waves
+from eagle_rl.models.foresight import MAX_CHANGE, Foresight, products, waves
 from tests.learner.test_correction import COMMAND_SIGN, JOINT_SIGN, MIRROR, PARTNER, correction, normal, toy
 
 HISTORY = 6
+HORIZON = 5
 HISTORY_MIRROR = (torch.tensor([1, 0, 2, 4, 3, 5]), torch.tensor([-1.0, -1.0, 1.0, 1.0, 1.0, 1.0]))
 YAW = 2
 TOWARDS = torch.tensor([0.0, 2.0, -1.0, 0.5, 0.0, 0.0])
@@ -43,7 +44,7 @@ def test_products_pair_every_number_with_every_other():
 
 def test_errors_of_the_next_step_are_foreseen_and_later_ones_that_cannot_be_are_not():
     trace = seen_world()
-    foresight = foresee([trace], damping=1.0)
+    foresight = foresee([trace], HORIZON, damping=1.0)
     ahead = foresight.features(trace.history[0], trace.phase[0], monomials(trace.command)) @ foresight.weights
     first, later = ahead.unflatten(1, (HORIZON, 5))[:, 0], ahead.unflatten(1, (HORIZON, 5))[:, 1:]
     expected = trace.history[0] @ TOWARDS
@@ -55,7 +56,7 @@ def test_errors_of_the_next_step_are_foreseen_and_later_ones_that_cannot_be_are_
 def test_the_change_takes_off_what_damping_leaves_of_the_error(damping):
     """By hand: joints that answer (3, 0, 4) take off 25 / (25 + damping squared) of an error."""
     trace = seen_world()
-    change = look(foresee([trace], damping=max(damping, 1e-2)), trace)
+    change = look(foresee([trace], HORIZON, damping=max(damping, 1e-2)), trace)
     small = change.abs().amax(dim=1) < MAX_CHANGE
     error = (trace.history[0] @ TOWARDS)[small]
     left = error + change[small] @ ANSWER
@@ -67,7 +68,7 @@ def test_a_change_is_bounded_and_so_is_what_one_entry_of_the_history_can_ask_for
     trace = seen_world()
     wild = trace.history.clone()
     wild[0, :, 1] = 100.0
-    foresight = foresee([trace], damping=1.0)
+    foresight = foresee([trace], HORIZON, damping=1.0)
     change = look(foresight, dataclasses.replace(trace, history=wild))
     assert change.abs().max() <= MAX_CHANGE
     wilder = wild.clone()
@@ -76,7 +77,7 @@ def test_a_change_is_bounded_and_so_is_what_one_entry_of_the_history_can_ask_for
 
 
 def test_an_entry_of_the_history_that_never_changes_is_not_looked_at():
-    assert foresee([seen_world()], damping=1.0).columns.tolist() == [0, 1, 2, 3, 4]
+    assert foresee([seen_world()], HORIZON, damping=1.0).columns.tolist() == [0, 1, 2, 3, 4]
 
 
 def test_the_mirror_image_of_a_mirror_image_is_the_trace_a_cycle_later():
@@ -90,7 +91,7 @@ def test_the_mirror_image_of_a_mirror_image_is_the_trace_a_cycle_later():
 def test_learned_from_both_sides_a_mirrored_robot_is_answered_by_the_mirrored_change():
     trace = seen_world(robots=200)
     image = trace.mirrored(MIRROR, HISTORY_MIRROR)
-    foresight = foresee([trace, image], damping=1.0)
+    foresight = foresee([trace, image], HORIZON, damping=1.0)
     change, mirrored = look(foresight, trace), look(foresight, image)
     torch.testing.assert_close(mirrored, change[:, PARTNER] * JOINT_SIGN, atol=2e-3, rtol=0)
     assert torch.equal(image.command, trace.command * COMMAND_SIGN)
@@ -144,7 +145,7 @@ def test_an_answer_follows_the_gait():
     cosine = waves(trace.phase, 1)[..., 1]
     error = trace.error.clone()
     error[..., YAW] = trace.history @ TOWARDS + (1 + cosine) * (trace.change @ ANSWER)
-    foresight = foresee([dataclasses.replace(trace, error=error)], damping=1.0)
+    foresight = foresee([dataclasses.replace(trace, error=error)], HORIZON, damping=1.0)
     late = torch.full_like(trace.phase[:1], 0.5)
     asked = look(foresight, dataclasses.replace(trace, phase=torch.zeros_like(late))).abs().mean()
     assert look(foresight, dataclasses.replace(trace, phase=late)).abs().mean() < 0.6 * asked

@@ -33,6 +33,8 @@ RESTING = "envs/mdp/posture.py"
 SEARCH = "eagle_rl/algorithms/search.py"
 SEARCHING = "eagle_rl/runners/searching.py"
 CORRECTION = "eagle_rl/models/correction.py"
+FORESIGHT = "eagle_rl/models/foresight.py"
+FORESEEING = "eagle_rl/algorithms/foresight.py"
 CORRECTING = "eagle_rl/algorithms/correction.py"
 CORRECTING_RUNNER = "eagle_rl/runners/correcting.py"
 FEEDBACK = "eagle_rl/algorithms/feedback.py"
@@ -210,7 +212,21 @@ MUTANTS: tuple[Mutant, ...] = (
     ),
     Mutant(CORRECTION, "SHIFT_UNIT * coefficients", "coefficients", "learner/test_correction.py"),
     Mutant(CORRECTION, " + extra) * walks", " + extra)", "learner/test_correction.py"),
-    Mutant(CORRECTION, "unsqueeze(1) * walks", "unsqueeze(1)", "learner/test_correction.py"),
+    Mutant(CORRECTION, "extra_actions) * walks", "extra_actions)", "learner/test_correction.py"),
+    Mutant(CORRECTION, 'obs["phase"], basis) * walks', 'obs["phase"], basis)', "learner/test_foresight.py"),
+    Mutant(FORESIGHT, "self.damping.square()", "self.damping", "learner/test_foresight.py"),
+    Mutant(FORESIGHT, "return -(answer", "return (answer", "learner/test_foresight.py"),
+    Mutant(FORESIGHT, ".clamp(-MAX_CHANGE, MAX_CHANGE)", "", "learner/test_foresight.py"),
+    Mutant(FORESEEING, "phase=self.phase + 0.5", "phase=self.phase", "learner/test_foresight.py"),
+    Mutant(
+        FORESEEING, "trace.error[h : h + steps]", "trace.error[horizon - 1 - h :][:steps]", "learner/test_foresight.py"
+    ),
+    Mutant(
+        CORRECTING_RUNNER,
+        "best = costs.index(min(costs))\n        how",
+        "best = 1\n        how",
+        "runners/test_correcting.py",
+    ),
     Mutant(CORRECTION, "self.yaw_scales[0] - command", "self.yaw_scales[0] + command", "learner/test_correction.py"),
     Mutant(FEEDBACK, "turned = -half_a_cycle", "turned = half_a_cycle", "learner/test_feedback.py"),
     Mutant(FEEDBACK, "downhill = -symmetric", "downhill = symmetric", "learner/test_feedback.py"),
