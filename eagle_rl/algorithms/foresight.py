@@ -74,8 +74,9 @@ def foresee(traces: Iterable[Trace], horizon: int, damping: float) -> Foresight:
     solution = torch.linalg.solve(normal.double(), right.double()).to(right)
     num_joints = traces[0].change.shape[2]
     answered = (2 * ANSWER_HARMONICS + 1) * num_joints
-    answer = solution[-answered:].unflatten(0, (-1, num_joints))
-    return Foresight(columns, looks.mean, looks.scale, solution[:-answered], answer, looks.damping)
+    weights, answer = (part.clone(memory_format=torch.contiguous_format) for part in solution.tensor_split([-answered]))
+    answer = answer.unflatten(0, (-1, num_joints))
+    return Foresight(columns, looks.mean, looks.scale, weights, answer, looks.damping)
 
 
 def _normal_equations(looks: Foresight, traces: list[Trace], horizon: int) -> tuple[Tensor, Tensor, int]:
