@@ -153,7 +153,7 @@ def test_an_answer_follows_the_gait():
     cosine = waves(trace.phase, 1)[..., 1]
     error = trace.error.clone()
     error[..., YAW] = trace.history @ TOWARDS + (1 + cosine) * (trace.change @ ANSWER)
-    foresight = foresee([dataclasses.replace(trace, error=error)], HORIZON, damping=1.0)
+    foresight = foresee([dataclasses.replace(trace, error=error)], HORIZON, damping=5.0)
     late = torch.full_like(trace.phase[:1], 0.5)
     asked = look(foresight, dataclasses.replace(trace, phase=torch.zeros_like(late))).abs().mean()
-    assert look(foresight, dataclasses.replace(trace, phase=late)).abs().mean() < 0.6 * asked
+    assert look(foresight, dataclasses.replace(trace, phase=late)).abs().mean() < 0.2 * asked
