@@ -38,7 +38,7 @@ class _Step:
     """Of M robots."""
 
     before: TensorDict
-    """Observations the action was chosen by."""
+    """What is kept of the observations the action was chosen by: history, phase and command."""
     phase: Tensor
     """Of the gait after it, shape (M,)."""
     error: Tensor
@@ -131,7 +131,7 @@ class Followers:
             obs, _, dones, extras = env.step(act(before))
             self.env_steps += len(commands)
             yield _Step(
-                before=before,
+                before=before.select("history", "phase", "command"),
                 phase=obs["phase"],
                 error=(env.measured_commands().to(commands) - commands) / self._units,
                 fell=dones.bool() & ~extras["time_outs"].bool(),
