@@ -15,8 +15,8 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
-from eagle_rl.models.correction import NUM_HARMONICS, NUM_SHIFTS, Correction, half_a_cycle, monomials
-from eagle_rl.models.foresight import waves
+from eagle_rl.models.basis import half_a_cycle, monomials, waves
+from eagle_rl.models.correction import NUM_HARMONICS, NUM_SHIFTS, Correction
 
 ERROR_HARMONICS = 10
 """Harmonics of an error that are looked at."""

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from eagle_rl.algorithms.correction import Mirror
-from eagle_rl.models.correction import half_a_cycle
+from eagle_rl.models.basis import half_a_cycle
 
 RIDGE = 0.3
 """Of the regression, in variances of a change for each robot [-]."""

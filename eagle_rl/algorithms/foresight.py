@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from eagle_rl.algorithms.correction import Mirror
-from eagle_rl.models.correction import monomials
-from eagle_rl.models.foresight import ANSWER_HARMONICS, Foresight, products, waves
+from eagle_rl.models.basis import monomials, products, waves
+from eagle_rl.models.foresight import ANSWER_HARMONICS, Foresight
 
 RIDGE = 1e-4
 """Of the regression, in multiples of the number of samples."""

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from itertools import combinations_with_replacement
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 
 from eagle_rl.models.actor import ACTOR_INPUTS, EagleActor
-from eagle_rl.models.foresight import Foresight, waves
+from eagle_rl.models.basis import monomials, waves
+from eagle_rl.models.foresight import Foresight
 
 NUM_HARMONICS = 5
 """Highest multiple of the gait's frequency that is added to an action; 50 Hz make 20 to 25 steps of a cycle."""
@@ -32,26 +32,12 @@ FEEDBACK_HARMONICS = 1
 """Of the gait, by which a gain may vary: a foot in stance can turn the pelvis, one in swing cannot."""
 YAW = 2
 """Column of the yaw rate in the newest frame, and of its command."""
-DEGREE = 3
-"""Of the polynomials of the command."""
 DOUBT = 0.05
 """Harm, and help, within which trust passes from nearly all to nearly nothing [error units]."""
 _FORESIGHT = "foresight."
 """What the names of its tensors begin with."""
 TRUSTED = -1.0
 """Harm expected of a new pass at every command, until something is known about it [error units]."""
-
-
-def half_a_cycle(num_harmonics: int) -> Tensor:
-    """What half a cycle does to the coefficients of :func:`waves`, shape (2 num_harmonics + 1,)."""
-    return (-1.0) ** torch.tensor([0, *(k for k in range(1, num_harmonics + 1) for _ in range(2))])
-
-
-def monomials(x: Tensor) -> Tensor:
-    """Products of up to ``DEGREE`` numbers of ``x`` (N, 5): 1, the numbers, and so on; shape (N, 56)."""
-    with_one = torch.cat((torch.ones_like(x[:, :1]), x), dim=1)
-    factors = list(combinations_with_replacement(range(with_one.shape[1]), DEGREE))
-    return with_one[:, factors].prod(dim=2)
 
 
 @dataclass(frozen=True)

@@ -7,11 +7,12 @@ the body: its prediction and its answer are linear, with coefficients that follo
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
+
+from eagle_rl.models.basis import products, waves
 
 REPEATED_HARMONICS = 10
 """Of the gait, in the part of the errors that repeats at each command."""
@@ -23,18 +24,6 @@ MAX_DEVIATION = 5.0
 """Of an entry of the history, beyond which it counts no more [standard deviations]."""
 MAX_CHANGE = 0.5
 """Of an action, in multiples of the correction's units."""
-
-
-def waves(phase: Tensor, num_harmonics: int) -> Tensor:
-    """1, cos 2 pi phi, sin 2 pi phi, cos 4 pi phi, ... of phases (...) [cycles], shape (..., 2 num_harmonics + 1)."""
-    angle = 2.0 * math.pi * phase.unsqueeze(-1) * torch.arange(1, num_harmonics + 1, device=phase.device)
-    both = torch.stack((torch.cos(angle), torch.sin(angle)), dim=-1).flatten(-2)
-    return torch.cat((torch.ones_like(phase).unsqueeze(-1), both), dim=-1)
-
-
-def products(a: Tensor, b: Tensor) -> Tensor:
-    """All products of a number of ``a`` (..., A) and one of ``b`` (..., B), shape (..., A B)."""
-    return (a.unsqueeze(-1) * b.unsqueeze(-2)).flatten(-2)
 
 
 @dataclass(frozen=True)

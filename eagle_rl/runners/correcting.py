@@ -19,14 +19,8 @@ from eagle_rl.algorithms.foresight import foresee
 from eagle_rl.config.schema import ExperimentCfg
 from eagle_rl.errors import EagleWarning
 from eagle_rl.evaluation.evaluate import MakeEnv
-from eagle_rl.models.correction import (
-    FEEDBACK_HARMONICS,
-    NUM_HARMONICS,
-    NUM_SHIFTS,
-    YAW,
-    Correction,
-    monomials,
-)
+from eagle_rl.models.basis import monomials
+from eagle_rl.models.correction import FEEDBACK_HARMONICS, NUM_HARMONICS, NUM_SHIFTS, YAW, Correction
 from eagle_rl.runners import checkpoint as ckpt
 from eagle_rl.runners.files import patiently
 from eagle_rl.runners.following import Followers

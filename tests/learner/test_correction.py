@@ -23,16 +23,8 @@ from eagle_rl.algorithms.correction import (
 )
 from eagle_rl.algorithms.specialists import SpecialistBank
 from eagle_rl.models.actor import ACTOR_INPUTS
-from eagle_rl.models.correction import (
-    DOUBT,
-    NUM_HARMONICS,
-    NUM_SHIFTS,
-    SHIFT_UNIT,
-    CorrectedPolicy,
-    Correction,
-    monomials,
-)
-from eagle_rl.models.foresight import waves
+from eagle_rl.models.basis import monomials, waves
+from eagle_rl.models.correction import DOUBT, NUM_HARMONICS, NUM_SHIFTS, SHIFT_UNIT, CorrectedPolicy, Correction
 from tests.learner.helpers import make_runner
 from tests.toy import ToyEnv
 

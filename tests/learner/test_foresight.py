@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from eagle_rl.algorithms.foresight import Trace, foresee
-from eagle_rl.models.correction import CorrectedPolicy, Correction, monomials
-from eagle_rl.models.foresight import MAX_CHANGE, Foresight, products, waves
+from eagle_rl.models.basis import monomials, products, waves
+from eagle_rl.models.correction import CorrectedPolicy, Correction
+from eagle_rl.models.foresight import MAX_CHANGE, Foresight
 from tests.learner.test_correction import COMMAND_SIGN, JOINT_SIGN, MIRROR, PARTNER, correction, normal, toy
 
 HISTORY = 6
