@@ -18,7 +18,7 @@ from eagle_rl.models.precision import set_up_torch
 from eagle_rl.runners.checkpoint import load_checkpoint, read_manifest
 from eagle_rl.runners.claims import Claim, ClaimLostError
 from eagle_rl.runners.files import patiently, write_atomically
-from eagle_rl.runners.judged import RESULT
+from eagle_rl.runners.judged import RESULT, training_steps
 from eagle_rl.runners.plan import Stage
 from eagle_rl.runners.provenance import Provenance
 from eagle_rl.runners.records import Record, active_stages, final_checkpoint, read_record, stage_dir, write_record
@@ -148,7 +148,11 @@ class Worker:
         ev = dataclasses.replace(cfg.evaluation, num_envs_per_robot=cfg.plan.judge_envs_per_robot)
         robots = evaluate(load_policy(job, checkpoint), self.make_env, cfg.robots, cfg.task, ev)
         result = EvaluationResult(
-            checkpoint=read_manifest(checkpoint)["sha256"], protocol=ev, robots=robots, seed=cfg.seed
+            checkpoint=read_manifest(checkpoint)["sha256"],
+            protocol=ev,
+            robots=robots,
+            seed=cfg.seed,
+            env_steps=training_steps(checkpoint),
         )
         patiently(lambda: write_atomically(job.folder / RESULT, result.to_json().encode()))
         return pooled_score(robots)

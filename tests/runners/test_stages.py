@@ -57,6 +57,7 @@ def test_every_stage_is_judged_on_its_own_robots(finished):
     result = EvaluationResult.read(path)
     assert list(result.robots) == ["two"]
     assert result.checkpoint == finished.records["round1/specialist_two"].sha256
+    assert result.env_steps == 2 * 3 * ENVS * STEPS, "the generalist's steps and its own"
 
 
 def test_a_specialist_starts_from_the_generalists_weights(tmp_path):
