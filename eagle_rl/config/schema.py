@@ -201,7 +201,8 @@ class CorrectionCfg:
     foresight_steps: int = 5
     """Control steps that are looked ahead."""
     std: float = 0.03
-    """Of the changes tried for every joint and harmonic [-]; 1 is an angle, an action's in the geometric mean."""
+    """Of the changes tried for every joint and harmonic [-]; 1 is an angle, an action's in the geometric mean. With 0
+    foresight stands alone, no pass is made."""
     damping: float = 6.0
     """Number of error units that weigh as much as a change of 1 [-]; with less of it robots fall."""
 

@@ -44,7 +44,7 @@ BOUNDS: dict[str, _Bound] = dict.fromkeys(
     algo.desired_kl algo.max_grad_norm algo.network.embedding_dim algo.network.init_std
     plan.generalist_env_steps plan.max_rounds
     search.num_pairs search.num_steps search.num_directions search.std search.step
-    correction.num_envs correction.num_steps correction.foresight_steps correction.std correction.damping
+    correction.num_envs correction.num_steps correction.foresight_steps correction.damping
     evaluation.num_envs_per_robot evaluation.num_steps evaluation.physics_dt evaluation.decimation
     run.save_interval run.keep_checkpoints
     """.split(),
@@ -231,13 +231,6 @@ def _plan_faults(cfg: ExperimentCfg) -> Iterator[Fault]:
         steps, settling = rollout.num_steps, rollout.settling_steps
         if steps <= settling:
             yield f"{name}.num_steps", f"got {steps}, expected more than {name}.settling_steps, {settling}"
-    correcting = cfg.correction
-    needed = correcting.settling_steps + correcting.foresight_steps
-    if correcting.foresight_std and correcting.settling_steps < correcting.num_steps < needed:
-        yield (
-            "correction.num_steps",
-            f"got {correcting.num_steps}, expected {needed} or more, to look ahead",
-        )
     for key in ("device", "env_device"):
         if not re.fullmatch(r"cpu|cuda(:\d+)?", getattr(cfg.run, key)):
             yield f"run.{key}", f"got {getattr(cfg.run, key)!r}, expected cpu, cuda or cuda:N"
@@ -245,7 +238,19 @@ def _plan_faults(cfg: ExperimentCfg) -> Iterator[Fault]:
         yield "name", f"got {cfg.name!r}, expected letters, digits, - and _: it names the run's folder"
 
 
+def _correction_faults(cfg: ExperimentCfg) -> Iterator[Fault]:
+    correcting = cfg.correction
+    if cfg.plan.correction_env_steps and not (correcting.std or correcting.foresight_std):
+        yield "correction.std", "0, and so is correction.foresight_std: nothing is left to correct with"
+    needed = correcting.settling_steps + correcting.foresight_steps
+    if correcting.foresight_std and correcting.settling_steps < correcting.num_steps < needed:
+        yield (
+            "correction.num_steps",
+            f"got {correcting.num_steps}, expected {needed} or more, to look ahead",
+        )
+
+
 def find_faults(cfg: ExperimentCfg) -> list[Fault]:
     """Everything wrong with a configuration whose types are right, in the order of the schema's groups."""
-    checks = (_single_faults, _task_faults, _learner_faults, _plan_faults)
+    checks = (_single_faults, _task_faults, _learner_faults, _plan_faults, _correction_faults)
     return [fault for check in checks for fault in check(cfg)]

@@ -67,7 +67,7 @@ class CorrectionRunner:
         """
         start = time.perf_counter()
         correction, mirror = self._begin()
-        for iteration in range(self.stage.iterations):
+        for iteration in range(self.stage.iterations if self.cfg.correction.std else 0):
             before, number = correction, 5 * iteration
             try:
                 tuned = self._tune(before.with_pass(), mirror, number)

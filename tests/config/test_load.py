@@ -192,6 +192,13 @@ def test_a_search_may_take_the_place_of_specialists_training_but_not_of_residual
         load_experiment("fork_compass", overrides)
 
 
+def test_a_correction_has_passes_or_foresight_or_both():
+    for alone in ("correction.std=0", "correction.foresight_std=0"):
+        load_experiment("fork_correct", [alone])
+    with pytest.raises(ConfigError, match=r"correction.std: 0, and so is correction.foresight_std"):
+        load_experiment("fork_correct", ["correction.std=0", "correction.foresight_std=0"])
+
+
 def test_every_bound_is_that_of_a_key():
     keys = {key for key, _ in leaves(ExperimentCfg(name="x"))}
     assert {*validate.BOUNDS, *validate.CEILINGS, *validate.POSITIVE_ITEMS} <= keys

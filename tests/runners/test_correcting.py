@@ -88,6 +88,15 @@ def test_what_is_foreseen_is_answered_on_top_of_all_passes(tmp_path):
         assert after < 0.95 * before, robot
 
 
+def test_without_passes_foresight_stands_alone(tmp_path):
+    _, result = corrected(tmp_path, std=0.0)
+    assert result.records["round1/correct_two"].env_steps == FORESIGHT
+    saved = load_correction(final_checkpoint(result.run_dir, "round1/correct_two"))
+    assert saved is not None
+    assert len(saved.weights) == len(saved.gains) == 0
+    assert saved.foresight is not None
+
+
 def test_a_foresight_that_makes_nothing_better_is_left_out(tmp_path, monkeypatch, capsys):
     foresee = correcting.foresee
 
