@@ -37,6 +37,8 @@ def export_onnx(actor: EagleActor, contract: Contract, path: Path) -> float:
     """
     module = ExportedActor(copy.deepcopy(actor)).eval()
     model = onnx.load_from_string(_to_onnx(module))
+    for node in model.graph.node:
+        node.ClearField("metadata_props")  # the exporter's call stacks, with paths of the machine it ran on
     model.metadata_props.add(key=METADATA_KEY, value=contract.to_json())
     model.metadata_props.add(key=DIGEST_KEY, value=contract.digest)
     data = model.SerializeToString()

@@ -14,6 +14,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+import eagle_rl
 from eagle_rl.cli.export import build_contract
 from eagle_rl.cli.sim2sim import MAX_TILT, simulate
 from eagle_rl.config.commands import parse_commands
@@ -55,6 +56,11 @@ def exported(tmp_path_factory):
 def test_onnx_and_torch_agree_for_one_and_for_many(exported):
     actor, path = exported
     assert compare(actor.as_onnx(), path.read_bytes()) <= TOLERANCE
+
+
+def test_a_file_to_give_away_holds_no_path_of_the_machine_it_was_made_on(exported):
+    for path in (Path(torch.__file__).parents[1], Path(eagle_rl.__file__).parents[1]):
+        assert str(path).encode() not in exported[1].read_bytes(), f"{path} is in the ONNX file: see export_onnx"
 
 
 def test_a_network_that_computes_something_else_is_not_written(exported, tmp_path, monkeypatch):
