@@ -100,12 +100,14 @@ class EaglePPO(PPO):
     @staticmethod
     def construct_algorithm(obs: TensorDict, env: VecEnv, cfg: dict[str, Any], device: str) -> EaglePPO:
         """Build models, storage and algorithm for an environment with ``robot_names`` and a ``mirror`` map."""
-        alg: EaglePPO = PPO.construct_algorithm(obs, env, cfg, device)
+        symmetric = cfg["algorithm"]["cfg"].network.symmetric
+        actor = cfg["actor"] | {"mirror": env.mirror if symmetric else None}
+        alg: EaglePPO = PPO.construct_algorithm(obs, env, cfg | {"actor": actor}, device)
         alg.storage = Rollout("rl", env.num_envs, cfg["num_steps_per_env"], obs, [env.num_actions], device)
         alg.robot_names = list(env.robot_names)
         if alg.cfg.estimation_coef > 0:
             alg.symmetry.terms.append(Estimation(alg.cfg.estimation_coef))
-        if alg.cfg.mirror_coef > 0:
+        if alg.cfg.mirror_coef > 0 and not symmetric:
             alg.symmetry.terms.append(Mirror(alg.cfg.mirror_coef, alg.cfg.mirror_fraction, env.mirror, device))
         return alg
 

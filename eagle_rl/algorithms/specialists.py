@@ -48,10 +48,7 @@ class SpecialistBank:
         for robot, (specialist, correction) in enumerate(zip(self.specialists, self.corrections, strict=True)):
             rows = (obs["robot"] == robot).nonzero(as_tuple=True)[0]
             inputs = (obs[group][rows] for group in ACTOR_INPUTS)
-            latent, embedding[rows], _ = specialist.features(*inputs)
-            if correction is None:
-                action[rows] = specialist.mlp(latent) * mask[rows]
-            else:
-                action[rows] = correction.act(specialist, obs[rows])
+            mean, embedding[rows], _ = specialist.outputs(*inputs)
+            action[rows] = mean * mask[rows] if correction is None else correction.act(specialist, obs[rows])
             std[rows] = specialist.distribution.std_param.clamp(*specialist.distribution.std_range) * mask[rows]
         return {"teacher_action": action, "teacher_std": std, "teacher_embedding": embedding}

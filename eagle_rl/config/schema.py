@@ -72,6 +72,9 @@ class NetworkCfg:
     """Initial standard deviation of every action [-] (ours)."""
     std_range: Range = (0.1, 1.2)
     """Bounds of the standard deviation (HugWBC 6)."""
+    symmetric: bool = False
+    """Act by the mean of what the networks say of a robot and, in the mirror, of its mirror image: left and right are
+    then exactly alike, without a mirror loss and for twice the actor's products (docs/experiments.md, 29) (ours)."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,8 @@ from torch.nn.functional import pad
 from eagle_rl.config.load import experiment_from_plain
 from eagle_rl.config.schema import ExperimentCfg, ObservationsCfg, TaskCfg
 from eagle_rl.errors import CheckpointError
+from eagle_rl.models.actor import SIDED_GROUPS
+from eagle_rl.models.sides import MirrorMap, Sides
 from eagle_rl.runners.checkpoint import load_checkpoint, load_correction, save_checkpoint, verify_checkpoint
 from eagle_rl.runners.files import write_atomically
 from eagle_rl.runners.locate import find_checkpoint
@@ -23,15 +26,23 @@ from eagle_rl.runners.published import SUFFIX
 _FIRST_LAYER = "mlp.0.weight"
 
 
-def take_root(cfg: ExperimentCfg, checkpoints: Path, provenance: Provenance, first: bool = True) -> Path:
+def take_root(
+    cfg: ExperimentCfg,
+    checkpoints: Path,
+    provenance: Provenance,
+    mirror: Callable[[], MirrorMap],
+    first: bool = True,
+) -> Path:
     """Put ``plan.root`` into a run, so that the run is complete without it; its checkpoint there.
 
-    A root that saw fewer harmonics of the clock gets inputs for them, with weights of zero: it acts as it did.
+    A root that saw fewer harmonics of the clock gets inputs for them, with weights of zero: it acts as it did. With
+    ``network.symmetric`` it acts on both sides from here on, with the weights it has.
 
     Args:
         cfg: the experiment.
         checkpoints: folder of the run's root stage.
         provenance: of that stage, for a root that is not taken over as it is.
+        mirror: of the experiment's observations and actions.
         first: whether this is the first of several data-parallel processes; the others leave reports to it.
 
     Raises:
@@ -47,13 +58,18 @@ def take_root(cfg: ExperimentCfg, checkpoints: Path, provenance: Provenance, fir
             "of its network. Use the stage before the correction, or a generalist distilled from it."
         )
     was = experiment_from_plain(manifest["config"], str(source)).task
+    state = load_checkpoint(source).state
+    symmetric, was_symmetric = cfg.algo.network.symmetric, bool(state["architecture"].get("mirror"))
     if first:
-        _tell_changed_meaning(source, was, cfg.task)
+        sides = changes("algo.network.symmetric", was_symmetric, symmetric)
+        _tell_changed_meaning(source, was, cfg.task, sides)
     new = clock_columns(cfg.task.observations) - clock_columns(was.observations)
-    if new > 0:
+    if new > 0 or symmetric != was_symmetric:
         about = {name: manifest[name] for name in ("iteration", "env_steps", "score")}
         if first:
-            state = widen_clock(load_checkpoint(source).state, new)
+            state = widen_clock(state, max(new, 0))
+            sides = Sides({group: mirror()[group] for group in SIDED_GROUPS}).to_lists() if symmetric else None
+            state["architecture"]["mirror"] = sides
             save_checkpoint(checkpoints, state, provenance, stage_end=True, **about)
         return checkpoints / f"model_{about['iteration']}.pt"
     checkpoints.mkdir(parents=True, exist_ok=True)
@@ -102,14 +118,14 @@ def widen_clock(state: dict[str, Any], columns: int) -> dict[str, Any]:
     }
 
 
-def _tell_changed_meaning(root: Path, was: TaskCfg, task: TaskCfg) -> None:
-    """Say what makes a root's observations and actions mean something else here; the weights would fit all the same."""
+def _tell_changed_meaning(root: Path, was: TaskCfg, task: TaskCfg, more: list[str]) -> None:
+    """Say what makes a root's observations and actions mean something else here, and what ``more`` does."""
     seen = dataclasses.replace(was.observations, clock_harmonics=task.observations.clock_harmonics)
     before, now = (
         {part: dataclasses.asdict(getattr(t, part)) for part in ("control", "observations", "gait")}
         for t in (dataclasses.replace(was, observations=seen), task)
     )
-    lines = changes("task", before, now)
+    lines = changes("task", before, now) + more
     if lines:
         listed = "\n  ".join(lines)
         text = f"warning: plan.root {root} was trained with other values, it acts differently here:\n  {listed}"

@@ -18,6 +18,7 @@ from eagle_rl.config.schema import ExperimentCfg
 from eagle_rl.errors import EagleWarning, Interrupted
 from eagle_rl.evaluation.evaluate import MakeEnv
 from eagle_rl.evaluation.trials import Act, PairedTrials
+from eagle_rl.models.actor import ACTOR_INPUTS
 from eagle_rl.runners import checkpoint as ckpt
 from eagle_rl.runners.files import patiently
 from eagle_rl.runners.interrupt import InterruptGuard
@@ -147,9 +148,12 @@ class SearchRunner:
     def _changed(self, search: LastLayerSearch, parameters: Tensor) -> Act:
         """The policy with other parameters (P, S, D + 1) in each environment."""
 
+        def last_layer(hidden: Tensor) -> Tensor:
+            return search.change(parameters, hidden, self._actor.mlp[-1](hidden))
+
         def act(obs: TensorDict) -> Tensor:
-            hidden = self._actor.hidden(obs)
-            return search.change(parameters, hidden, self._actor.mlp[-1](hidden)) * obs["slot_mask"]
+            history, command, clock = (obs[group] for group in ACTOR_INPUTS)
+            return self._actor.outputs(history, command, clock, last_layer)[0] * obs["slot_mask"]
 
         return act
 

@@ -15,6 +15,7 @@ from eagle_rl.config.schema import ExperimentCfg
 from eagle_rl.evaluation.evaluate import MakeEnv, Policy
 from eagle_rl.models import EagleActor
 from eagle_rl.models.correction import CorrectedPolicy
+from eagle_rl.models.sides import MirrorMap
 from eagle_rl.runners.checkpoint import (
     latest_checkpoint,
     load_actor,
@@ -75,7 +76,7 @@ def train(job: Job) -> Path:
     if latest is not None and read_manifest(latest)["stage_end"]:
         return latest
     if job.stage.kind == "root":
-        return take_root(job.cfg, checkpoints, job.provenance, first=job.rank == 0)
+        return take_root(job.cfg, checkpoints, job.provenance, lambda: _mirror(job), first=job.rank == 0)
     if job.stage.kind == "search":
         return _search(job, latest)
     if job.stage.kind == "correct":
@@ -90,6 +91,12 @@ def train(job: Job) -> Path:
     left = job.stage.iterations - runner.current_learning_iteration
     runner.learn(left, on_iteration=lambda iteration: job.check_claim())
     return checkpoints / f"model_{job.stage.iterations}.pt"
+
+
+def _mirror(job: Job) -> MirrorMap:
+    """Left and right exchanged in what the environment shows and takes."""
+    mirror: MirrorMap = job.make_env(job.cfg.robots, len(job.cfg.robots), job.cfg.task, job.stage.seed).mirror
+    return mirror
 
 
 def _search(job: Job, latest: Path | None) -> Path:

@@ -1,6 +1,7 @@
 """The policy as the rest of the project uses it."""
 
 import copy
+import dataclasses
 
 import pytest
 import torch
@@ -8,7 +9,7 @@ from tensordict import TensorDict
 
 from eagle_rl.models import EagleActor
 from eagle_rl.models.actor import ACTOR_INPUTS
-from tests.learner.helpers import make_runner
+from tests.learner.helpers import NETWORK, make_runner
 from tests.toy import FRAMES, ToyEnv
 
 
@@ -26,11 +27,14 @@ def obs() -> TensorDict:
 
 
 def test_the_policy_head_reads_embedding_estimate_newest_frame_command_and_clock(actor, obs):
-    latent = actor.get_latent(obs)
+    latent, embedding, estimate = actor.features(*(obs[group] for group in ACTOR_INPUTS))
     newest = obs["history"][:, : obs["history"].shape[1] // FRAMES]
-    assert torch.equal(latent, torch.cat([actor.embedding, actor.estimate, newest, obs["command"], obs["clock"]], 1))
-    assert torch.equal(actor.embedding, actor.encoder(obs["history"]))
-    assert torch.equal(actor.estimate, actor.estimator(actor.embedding))
+    assert torch.equal(latent, torch.cat([embedding, estimate, newest, obs["command"], obs["clock"]], 1))
+    assert torch.equal(embedding, actor.encoder(obs["history"]))
+    assert torch.equal(estimate, actor.estimator(embedding))
+    actor(obs)
+    assert torch.equal(actor.embedding, embedding)
+    assert torch.equal(actor.estimate, estimate)
 
 
 def test_the_policy_gradient_reaches_estimator_and_encoder(actor, obs):
@@ -82,3 +86,71 @@ def test_a_history_that_is_not_whole_frames_is_refused(actor, obs):
 def test_the_last_layer_makes_the_mean_actions_of_the_hidden_activations(actor, obs):
     expected = actor(obs)
     torch.testing.assert_close(actor.mlp[-1](actor.hidden(obs)) * obs["slot_mask"], expected)
+
+
+# --- two-sided ------------------------------------------------------------------------------------------------------
+
+
+def two_sided(**algo) -> EagleActor:
+    return make_runner(network=dataclasses.replace(NETWORK, symmetric=True), **algo).alg.actor
+
+
+def mirrored(obs, mirror):
+    seen = {group: obs[group][:, mirror[group][0]] * mirror[group][1] for group in ACTOR_INPUTS}
+    perm, _ = mirror["actions"]
+    return TensorDict(seen | {"slot_mask": obs["slot_mask"][:, perm]}, batch_size=obs.batch_size)
+
+
+def test_a_two_sided_policy_does_in_the_mirror_exactly_what_it_does(obs):
+    actor, mirror = two_sided(), ToyEnv().mirror
+    perm, sign = mirror["actions"]
+    everywhere = obs.clone()
+    everywhere["slot_mask"] = torch.ones_like(obs["slot_mask"])
+    actions = actor(everywhere)
+    assert torch.equal(actor(mirrored(everywhere, mirror)), actions[:, perm] * sign)
+    assert actions.abs().max() > 1e-3, "a policy that does nothing is symmetric and proves nothing"
+
+
+def test_its_mean_is_that_of_its_networks_on_both_sides(obs):
+    actor, mirror = two_sided(), ToyEnv().mirror
+    alone = copy.deepcopy(actor).with_sides(None)
+    perm, sign = mirror["actions"]
+    here, there = alone(obs), alone(mirrored(obs, mirror))[:, perm] * sign
+    assert not torch.allclose(here, there, atol=1e-3), "untrained networks know nothing of the mirror"
+    torch.testing.assert_close(actor(obs), 0.5 * (here + there) * obs["slot_mask"])
+    assert torch.equal(actor.embedding, alone.encoder(obs["history"]))
+
+
+def test_both_sides_learn(obs):
+    actor = two_sided()
+    actor(obs).square().sum().backward()
+    once = actor.mlp[-1].bias.grad.clone()
+    perm, sign = ToyEnv().mirror["actions"]
+    torch.testing.assert_close(once[perm] * sign, once, msg="a mean of both sides moves both sides alike")
+
+
+def test_a_two_sided_policy_is_rebuilt_copied_and_exported_as_such(obs):
+    actor = two_sided()
+    with torch.device("meta"):  # as a checkpoint's is
+        twin = EagleActor.from_architecture(actor.architecture)
+    twin.load_state_dict(actor.state_dict(), assign=True)
+    inputs = [obs[group] for group in (*ACTOR_INPUTS, "slot_mask")]
+    for same in (twin, copy.deepcopy(actor)):
+        assert torch.equal(same(obs), actor(obs))
+    assert torch.equal(actor.as_onnx()(*inputs)[0], actor(obs))
+    assert set(actor.state_dict()) == set(make_runner().alg.actor.state_dict()), "a mirror is no weight"
+
+
+def test_another_last_layer_acts_on_both_sides(obs):
+    actor = two_sided()
+    inputs = [obs[group] for group in ACTOR_INPUTS]
+    torch.testing.assert_close(actor.outputs(*inputs, actor.mlp[-1])[0], actor.outputs(*inputs)[0])
+    nothing = actor.outputs(*inputs, lambda hidden: torch.zeros(len(hidden), 32))[0]
+    assert not nothing.any()
+
+
+def test_a_two_sided_policy_needs_no_mirror_loss():
+    names = [type(term).__name__ for term in make_runner().alg.symmetry.terms]
+    assert "Mirror" in names
+    symmetric = make_runner(network=dataclasses.replace(NETWORK, symmetric=True))
+    assert [type(term).__name__ for term in symmetric.alg.symmetry.terms] == [n for n in names if n != "Mirror"]

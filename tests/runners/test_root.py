@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from eagle_rl.errors import CheckpointError
+from eagle_rl.models.actor import ACTOR_INPUTS
 from eagle_rl.runners.checkpoint import load_actor, load_checkpoint
 from eagle_rl.runners.plan import plan_stages
 from eagle_rl.runners.records import final_checkpoint
@@ -99,3 +100,37 @@ def test_a_root_that_saw_more_of_the_clock_is_refused(root, tmp_path):
     cfg = toy_experiment(iterations=1, judge_envs=0, method="ppo", root=str(wide))
     with pytest.raises(CheckpointError, match="expected"):
         run_experiment(cfg, tmp_path / "run", make_toy_env)
+
+
+def symmetric(cfg):
+    return replace(cfg, algo=replace(cfg.algo, network=replace(cfg.algo.network, symmetric=True)))
+
+
+def test_a_root_acts_on_both_sides_from_here_on_with_the_weights_it_has(root, tmp_path, capsys):
+    cfg = symmetric(toy_experiment(iterations=1, judge_envs=0, method="ppo", root=str(root)))
+    path = train(toy_job(cfg, plan_stages(cfg)[0], tmp_path / "there"))
+    assert "algo.network.symmetric: False -> True" in capsys.readouterr().err
+    before, after = load_actor(root)[0], load_actor(path)[0]
+    assert before.sides is None
+    assert {name: x.tolist() for name, x in after.state_dict().items()} == {
+        name: x.tolist() for name, x in before.state_dict().items()
+    }
+    env = make_toy_env(cfg.robots, ENVS, cfg.task, seed=3)
+    obs, (perm, sign) = env.get_observations(), env.mirror["actions"]
+    seen = obs.clone()
+    for group in ACTOR_INPUTS:
+        seen[group] = obs[group][:, env.mirror[group][0]] * env.mirror[group][1]
+    seen["slot_mask"] = torch.ones_like(obs["slot_mask"])
+    both = 0.5 * (before(obs) + before(seen)[:, perm] * sign * obs["slot_mask"])
+    torch.testing.assert_close(after(obs), both)
+
+    back = replace(cfg, algo=toy_experiment(iterations=1).algo, plan=replace(cfg.plan, root=str(path)))
+    again = train(toy_job(back, plan_stages(back)[0], tmp_path / "back"))
+    assert load_actor(again)[0].sides is None
+
+
+def test_every_stage_after_it_is_two_sided_too(root, tmp_path):
+    cfg = symmetric(toy_experiment(iterations=2, judge_envs=0, method="eagle", root=str(root)))
+    result = run_experiment(cfg, tmp_path / "run", make_toy_env)
+    for stage in ("round1/specialist_one", "round1/distill"):
+        assert load_actor(final_checkpoint(result.run_dir, stage))[0].sides is not None, stage
