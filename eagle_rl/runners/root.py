@@ -61,8 +61,7 @@ def take_root(
     state = load_checkpoint(source).state
     symmetric, was_symmetric = cfg.algo.network.symmetric, bool(state["architecture"].get("mirror"))
     if first:
-        sides = changes("algo.network.symmetric", was_symmetric, symmetric)
-        _tell_changed_meaning(source, was, cfg.task, sides)
+        _tell_changed_meaning(source, was, cfg.task, changes("algo.network.symmetric", was_symmetric, symmetric))
     new = clock_columns(cfg.task.observations) - clock_columns(was.observations)
     if new > 0 or symmetric != was_symmetric:
         about = {name: manifest[name] for name in ("iteration", "env_steps", "score")}
