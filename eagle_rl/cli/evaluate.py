@@ -51,7 +51,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--envs", type=count, metavar="N", help="environments per robot [the experiment's]")
     parser.add_argument("--steps", type=count, metavar="N", help="control steps [the experiment's, 1000 in the paper]")
     parser.add_argument(
-        "--protocol", choices=("single", "joint", "standing"), help="draw one command, all five, or posture"
+        "--protocol",
+        choices=("single", "joint", "upright", "standing"),
+        help="draw one command, all five, the three velocities, or posture",
     )
     parser.add_argument(
         "--resample",

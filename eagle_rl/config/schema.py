@@ -216,8 +216,9 @@ class EvaluationCfg:
 
     num_envs_per_robot: int = 2048
     num_steps: int = 1000
-    protocol: Literal["single", "joint", "standing"] = "joint"
-    """``single`` varies one command and keeps the others at zero; ``joint`` samples all five; ``standing`` samples
+    protocol: Literal["single", "joint", "upright", "standing"] = "joint"
+    """``single`` varies one command and keeps the others at zero; ``joint`` samples all five; ``upright`` samples the
+    velocities and keeps height and pitch at zero, as a robot is driven that has no others; ``standing`` samples
     posture with all velocities exactly zero, in every second draw where commands are redrawn."""
     resampling_time_s: float = 0.0
     """0 keeps commands for the episode; otherwise redraw every so many seconds."""

@@ -63,7 +63,7 @@ def judged_commands(ev: EvaluationCfg, num_envs: int) -> Tensor:
     """Which errors of each environment count, bool, shape (num_envs, 5).
 
     ``single`` judges environment i on the dimension i mod 5, the others judge all five; while a robot stands, its
-    errors of velocity are the speed at which it drifts.
+    errors of velocity are the speed at which it drifts, and while it is upright those of posture are how it sags.
     """
     if ev.protocol == "single":
         return torch.arange(num_envs).unsqueeze(1) % len(COMMANDS) == torch.arange(len(COMMANDS))
@@ -73,10 +73,12 @@ def judged_commands(ev: EvaluationCfg, num_envs: int) -> Tensor:
 def drawn_commands(ev: EvaluationCfg, num_envs: int) -> Tensor:
     """Which commands are not zero, by draw, bool, shape (num_envs, draws, 5).
 
-    ``standing`` keeps the velocities at zero; with redraws, in every second draw, so that at any time half of the
-    environments walk, and all of them stop and start.
+    ``upright`` keeps the postures at zero, ``standing`` the velocities; with redraws, in every second draw, so that at
+    any time half of the environments walk, and all of them stop and start.
     """
     drawn = judged_commands(ev, num_envs).unsqueeze(1).repeat(1, num_draws(ev), 1)
+    if ev.protocol == "upright":
+        drawn[..., NUM_VELOCITIES:] = False
     if ev.protocol == "standing":
         turn = torch.arange(num_envs).unsqueeze(1) + torch.arange(num_draws(ev))
         drawn[..., :NUM_VELOCITIES] = ((turn % 2 == 1) & (num_draws(ev) > 1)).unsqueeze(2)

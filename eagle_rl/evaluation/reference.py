@@ -23,10 +23,14 @@ BEST_CONSTANT: Errors = (0.45, 0.20, 0.50, 0.075, 0.20)
 def floors(ev: EvaluationCfg) -> dict[str, Errors]:
     """What robots that ignore their command score in a protocol.
 
-    Where half of the draws have no velocity, the best constant velocity is zero too.
+    Where half of the draws have no velocity, the best constant velocity is zero too; so is the best constant posture
+    where postures stay at zero.
     """
+    constant = {"stand still": STAND_STILL, "best constant": BEST_CONSTANT}
+    if ev.protocol == "upright":
+        return {name: (v_x, v_y, omega, 0.0, 0.0) for name, (v_x, v_y, omega, _, _) in constant.items()}
     if ev.protocol != "standing":
-        return {"stand still": STAND_STILL, "best constant": BEST_CONSTANT}
+        return constant
     walking = 0.5 if num_draws(ev) > 1 else 0.0
     v_x, v_y, omega = (walking * error for error in STAND_STILL[:3])
     return {

@@ -78,6 +78,7 @@ def _over_seeds(values: Sequence[float | None], paper: float | None = None) -> C
 _DRAWN = {
     "single": "one command drawn, the others zero",
     "joint": "all five commands drawn",
+    "upright": "velocities drawn, height and pitch zero,",
     "standing": "velocities exactly zero, height and pitch drawn",
 }
 
@@ -117,10 +118,10 @@ def tracking_table(
         subset: one of ``metrics.SUBSETS``; the floors are of all steps and are left out for others.
         falls: what counts after a fall.
         paper: the paper's errors by method and robot; not shown for robots a method was not trained on, nor
-            for standing, which the paper does not judge by itself.
+            for upright or standing robots, which the paper does not judge by themselves.
     """
     ev = _common_protocol(result for runs in results.values() for result in runs)
-    paper = {} if ev.protocol == "standing" else paper
+    paper = paper if ev.protocol in ("single", "joint") else {}
     robots = list(dict.fromkeys(robot for runs in results.values() for result in runs for robot in result.robots))
     rows = []
     for robot in robots:

@@ -26,7 +26,7 @@ def run(policy, make_env=make_scripted_env, ev=EV, **kwargs) -> RobotMetrics:
     return evaluate(policy, make_env, ["h1"], TaskCfg(), ev, **kwargs)["h1"]
 
 
-@pytest.mark.parametrize("protocol", ["single", "joint", "standing"])
+@pytest.mark.parametrize("protocol", ["single", "joint", "upright", "standing"])
 def test_a_perfect_tracker_scores_zero(protocol):
     metrics = run(perfect, ev=dataclasses.replace(EV, protocol=protocol))
     assert metrics.survival == 1.0
@@ -39,26 +39,29 @@ def constantly(*measured: float) -> Callable[[TensorDict], Tensor]:
 
 
 @pytest.mark.parametrize(
-    ("protocol", "resampling_time_s", "velocities"),
+    ("protocol", "resampling_time_s", "floor"),
     [
-        ("single", 0.0, (0.50, 0.20, 0.50)),
-        ("joint", 0.0, (0.50, 0.20, 0.50)),
-        ("joint", 0.02, (0.50, 0.20, 0.50)),
-        ("standing", 0.0, (0.0, 0.0, 0.0)),
-        ("standing", 0.02, (0.25, 0.10, 0.25)),
+        ("single", 0.0, (0.50, 0.20, 0.50, 0.15, 0.2125)),
+        ("joint", 0.0, (0.50, 0.20, 0.50, 0.15, 0.2125)),
+        ("joint", 0.02, (0.50, 0.20, 0.50, 0.15, 0.2125)),
+        ("upright", 0.0, (0.50, 0.20, 0.50, 0.0, 0.0)),
+        ("standing", 0.0, (0.0, 0.0, 0.0, 0.15, 0.2125)),
+        ("standing", 0.02, (0.25, 0.10, 0.25, 0.15, 0.2125)),
     ],
 )
-def test_an_idle_robot_scores_the_closed_form_floors(protocol, resampling_time_s, velocities):
+def test_an_idle_robot_scores_the_closed_form_floors(protocol, resampling_time_s, floor):
     ev = dataclasses.replace(EV, protocol=protocol, resampling_time_s=resampling_time_s)
-    floor = (*velocities, 0.15, 0.2125)
     assert floors(ev)["stand still"] == pytest.approx(floor)
     assert run(idle, ev=ev).subsets["all"].errors == pytest.approx(floor, rel=0.05)
 
 
-@pytest.mark.parametrize(("protocol", "forward"), [("joint", 0.3), ("standing", 0.0)])
-def test_the_best_constant_scores_its_closed_form(protocol, forward):
+@pytest.mark.parametrize(
+    ("protocol", "forward", "posture"),
+    [("joint", 0.3, (-0.15, 0.1)), ("upright", 0.3, (0.0, 0.0)), ("standing", 0.0, (-0.15, 0.1))],
+)
+def test_the_best_constant_scores_its_closed_form(protocol, forward, posture):
     ev = dataclasses.replace(EV, protocol=protocol)
-    metrics = run(constantly(forward, 0.0, 0.0, -0.15, 0.1), ev=ev)
+    metrics = run(constantly(forward, 0.0, 0.0, *posture), ev=ev)
     assert metrics.subsets["all"].errors == pytest.approx(floors(ev)["best constant"], rel=0.05)
 
 

@@ -20,7 +20,7 @@ def test_more_environments_move_nobody_elses_commands(few, more):
     assert torch.equal(draw_commands(CFG, EV, "h1", few), draw_commands(CFG, EV, "h1", few + more)[:few])
 
 
-@given(seed=st.integers(0, 2**31), protocol=st.sampled_from(["single", "joint", "standing"]))
+@given(seed=st.integers(0, 2**31), protocol=st.sampled_from(["single", "joint", "upright", "standing"]))
 def test_commands_stay_in_the_finishing_ranges_and_others_are_zero(seed, protocol):
     ev = dataclasses.replace(EV, seed=seed, protocol=protocol)
     commands = draw_commands(CFG, ev, "g1", 40)
@@ -37,6 +37,14 @@ def test_single_splits_the_environments_evenly_over_the_commands():
     assert (judged.sum(0) == 20).all()
     assert (judged.sum(1) == 1).all()
     assert torch.equal(drawn_commands(ev, 100), judged.unsqueeze(1))
+
+
+def test_upright_holds_every_posture_at_exactly_zero_and_judges_all_five():
+    ev = EvaluationCfg(protocol="upright")
+    commands = draw_commands(CFG, ev, "h1", 50)
+    assert (commands[..., 3:] == 0).all()
+    assert (commands[..., :3] != 0).all()
+    assert judged_commands(ev, 50).all()
 
 
 def test_standing_holds_every_velocity_at_exactly_zero_and_judges_all_five():

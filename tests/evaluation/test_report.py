@@ -66,12 +66,13 @@ def test_a_robot_a_method_was_not_trained_on_is_labelled_and_the_papers_number_l
     ]
 
 
-def test_standing_has_floors_of_its_own_and_no_numbers_of_the_paper():
-    ev = dataclasses.replace(EV, protocol="standing")
+@pytest.mark.parametrize(("protocol", "zero", "told"), [("standing", 0, "exactly zero"), ("upright", 3, "height and")])
+def test_standing_and_upright_have_floors_of_their_own_and_no_numbers_of_the_paper(protocol, zero, told):
+    ev = dataclasses.replace(EV, protocol=protocol)
     table = tracking_table({"PPO": [result((0.1,) * 5, ev=ev)]})
-    assert table.rows[0].cells[0].mean == 0.0
+    assert table.rows[0].cells[zero].mean == 0.0
     assert table.rows[-1].cells[0].paper is None
-    assert "exactly zero" in table.caption
+    assert told in table.caption
 
 
 def test_charged_errors_are_shown_unless_asked_otherwise():
