@@ -52,7 +52,8 @@ def _text(value: Any) -> str:
 def _commands(cfg: CommandsCfg) -> Table:
     ranges = {name: getattr(cfg, name) for name in COMMAND_UNITS}
     rows = [(name, _text(r.initial), _text(r.finishing), COMMAND_UNITS[name]) for name, r in ranges.items()]
-    title = f"Commands: drawn every {cfg.resampling_time_s:g} s, standing with probability {cfg.standing_probability:g}"
+    shares = f"standing with probability {cfg.standing_probability:g}, upright with {cfg.upright_probability:g}"
+    title = f"Commands: drawn every {cfg.resampling_time_s:g} s, {shares}"
     return make_table(title, ("command", "initial", "finishing", "unit"), rows)
 
 

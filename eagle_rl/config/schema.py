@@ -195,6 +195,8 @@ class CorrectionCfg:
     """Robots in a rollout; a probe takes three rollouts [-]."""
     num_steps: int = 220
     """Control steps of a rollout, from rest."""
+    upright_share: float = 0.25
+    """Of the robots, whose height and pitch commands are zero [-]; see ``task.commands.upright_probability``."""
     settling_steps: int = 60
     """The first of them, which are not looked at."""
     gain_std: float = 0.03

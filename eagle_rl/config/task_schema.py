@@ -120,6 +120,9 @@ class CommandsCfg:
     then takes as much time as what it can do (ours: else a robot that falls in 3 s stands in 3 % of its time)."""
     standing_probability: float = 0.1
     """Share of draws with zero velocity [-] (HugWBC 2)."""
+    upright_probability: float = 0.0
+    """Share of draws with zero height and pitch [-]: a robot is mostly driven so, but it is a corner of the ranges that
+    uniform draws hardly come near (docs/experiments.md, 29) (ours)."""
     lin_vel_dead_zone: float = 0.15
     """Planar speed at or under which v_x and v_y become zero [m/s] (HugWBC 2)."""
     ang_vel_dead_zone: float = 0.15

@@ -52,13 +52,14 @@ BOUNDS: dict[str, _Bound] = dict.fromkeys(
 )
 BOUNDS |= dict.fromkeys(
     """
-    task.commands.standing_probability task.commands.curriculum.weight_step
+    task.commands.standing_probability task.commands.upright_probability task.commands.curriculum.weight_step
     task.commands.curriculum.lin_vel_threshold task.commands.curriculum.ang_vel_threshold
     task.commands.curriculum.contact_force_threshold task.commands.curriculum.contact_vel_threshold
     task.gait.phase_offset task.gait.leg_scaling task.aids.harness_decay task.aids.gait_shaping_decay
     task.aids.min_episode_ratio task.aids.harness_return_ratio task.aids.min_contact_match
     task.aids.harness_contact_match task.control.upper_ratio task.control.waist_ratio
     algo.lam plan.tolerance plan.start_share search.standing_probability search.randomized_share
+    correction.upright_share
     """.split(),
     _SHARE,
 )

@@ -14,7 +14,7 @@ from eagle_rl.algorithms.correction import error_waves
 from eagle_rl.algorithms.foresight import Trace
 from eagle_rl.config.schema import EvaluationCfg, ExperimentCfg
 from eagle_rl.evaluation.evaluate import MakeEnv
-from eagle_rl.evaluation.protocol import COMMANDS, draw_commands, evaluation_task
+from eagle_rl.evaluation.protocol import COMMANDS, NUM_VELOCITIES, draw_commands, evaluation_task
 from eagle_rl.models import EagleActor
 from eagle_rl.models.correction import Correction
 
@@ -123,6 +123,7 @@ class Followers:
         ev = replace(ev, seed=self._seed + number)
         drawn = draw_commands(self.cfg.task.commands, ev, self.cfg.robots[0], correcting.num_envs)
         commands = drawn[:, 0].to(self._units)
+        commands[: round(correcting.upright_share * len(commands)), NUM_VELOCITIES:] = 0.0
         env = self.env(correcting.num_envs, ev)
         env.pin_commands(commands)
         obs = env.get_observations()

@@ -114,9 +114,11 @@ class CommandSampler:
         """
         if self.cfg.curriculum.enabled:
             self._credit(ids)
-        draws = self._rng.uniform(_STREAM, count, 7, ids).to(torch.float64)
+        draws = self._rng.uniform(_STREAM, count, 8, ids).to(torch.float64)
         command, bins = self._draw(self.robot_id[ids], draws)
         command, zeroed = self._zero_small(command, draws[:, 6] < self.cfg.standing_probability)
+        upright = draws[:, 7] < self.cfg.upright_probability
+        command[:, 3:] = command[:, 3:].masked_fill(upright.unsqueeze(1), 0.0)
         self._bin[ids] = bins
         self._creditable[ids] = ~zeroed
         self._sums[ids] = 0.0
@@ -127,7 +129,7 @@ class CommandSampler:
         self._creditable[ids] = False
 
     def _draw(self, robot: Tensor, draws: Tensor) -> tuple[Tensor, Tensor]:
-        """Uniform numbers (n, 7) to raw commands (n, 5) and grid bins (n,).
+        """Uniform numbers (n, 8) to raw commands (n, 5) and grid bins (n,).
 
         v_y, height and pitch come from their initial ranges until a robot's grid is complete, then the finishing ones.
         """

@@ -64,6 +64,16 @@ def test_a_tenth_of_the_draws_stand() -> None:
     assert share == pytest.approx(CFG.standing_probability, abs=0.02)
 
 
+def test_a_share_of_the_draws_is_upright_and_moves_nothing_else() -> None:
+    cfg = replace(CFG, upright_probability=0.3)
+    commands, others = (torch.cat([draw(sampler(c), count)[0] for count in range(20)]) for c in (cfg, CFG))
+    upright = (commands[:, 3:] == 0).all(dim=1)
+    assert upright.double().mean().item() == pytest.approx(0.3, abs=0.02)
+    assert torch.equal(commands[:, :3], others[:, :3]), "velocities are drawn as without"
+    assert torch.equal(commands[~upright], others[~upright])
+    assert not (others[:, 3:] == 0).any()
+
+
 def test_draws_fill_the_range_evenly_once_the_curriculum_is_done() -> None:
     cfg = replace(CFG, curriculum=CommandCurriculumCfg(enabled=False), standing_probability=0.0)
     command = torch.cat([draw(sampler(cfg), count)[0] for count in range(50)])
