@@ -78,6 +78,7 @@ class EaglePPO(PPO):
         )
         for model in (actor, critic):
             keep_outputs_exact(model)
+        critic.requires_grad_(cfg.use_ppo_loss)  # imitation alone has nothing to teach it
         self.cfg = cfg
         self.is_multi_gpu = True  # makes update() call reduce_parameters(), where gradients are checked
         self.specialists: SpecialistBank | None = None

@@ -318,6 +318,7 @@ def test_pure_imitation_leaves_the_critic_and_the_exploration_alone():
     for key, x in parameters(runner).items():
         still = key.startswith("critic") or key == "actor.distribution.std_param"
         assert torch.equal(x, before[key]) == still, key
+    assert all(p.grad is None for p in runner.alg.critic.parameters()), "no time is spent on what it does not learn"
 
 
 def test_kickstarting_fades_with_the_iterations_of_its_stage():

@@ -44,6 +44,7 @@ GAUSSIAN = "eagle_rl/models/distribution.py"
 PPO = "eagle_rl/algorithms/eagle_ppo.py"
 ENV = "envs/humanoid_env.py"
 AUXILIARY = "eagle_rl/algorithms/auxiliary.py"
+ACTOR = "eagle_rl/models/actor.py"
 
 REWARD_TESTS = "mdp/test_rewards.py"
 LEARNER_TESTS = "learner/test_eagle_ppo.py"
@@ -134,6 +135,12 @@ MUTANTS: tuple[Mutant, ...] = (
     # commands, aids, errors
     Mutant(COMMANDS, "mean > self._thresholds", "mean < self._thresholds", "mdp/test_commands.py"),
     Mutant(COMMANDS, "wins @ self._grid.neighbours", "wins", "mdp/test_commands.py"),
+    Mutant(COMMANDS, "command[:, 3:] = command[:, 3:]", "command[:, 2:] = command[:, 2:]", "mdp/test_commands.py"),
+    Mutant("eagle_rl/runners/following.py", ", NUM_VELOCITIES:] = 0.0", ", :] = 0.0", "runners/test_correcting.py"),
+    Mutant(ACTOR, 'self.sides.mirrored("actions", head(', "(head(", "learner/test_actor.py"),
+    Mutant(ACTOR, "self.sides.mirrored(group, x) for", "x for", "learner/test_actor.py"),
+    Mutant(ACTOR, "0.5 * (mean +", "0.5 * (mean -", "learner/test_actor.py"),
+    Mutant("eagle_rl/models/sides.py", ' * getattr(self, f"{group}_sign")', "", "learner/test_actor.py"),
     Mutant(
         COMMANDS,
         "(planar[:, :1], others[:, :1], planar[:, 1:], others[:, 1:])",

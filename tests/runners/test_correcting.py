@@ -13,6 +13,7 @@ from eagle_rl.errors import CheckpointError, EagleWarning
 from eagle_rl.models.correction import CorrectedPolicy
 from eagle_rl.runners import correcting
 from eagle_rl.runners.checkpoint import load_actor, load_checkpoint, load_correction, save_checkpoint
+from eagle_rl.runners.following import Followers
 from eagle_rl.runners.plan import plan_stages
 from eagle_rl.runners.provenance import Provenance
 from eagle_rl.runners.records import final_checkpoint
@@ -111,6 +112,20 @@ def test_a_foresight_that_makes_nothing_better_is_left_out(tmp_path, monkeypatch
         assert saved is not None
         assert saved.foresight is None, robot
     assert "with foresight left out" in capsys.readouterr().err
+
+
+def test_a_share_of_the_robots_is_upright_whichever_commands_are_drawn(tmp_path):
+    cfg, result = corrected(tmp_path, probes=1)
+    one = dataclasses.replace(cfg, robots=("one",), correction=dataclasses.replace(CORRECTION, upright_share=0.25))
+    path = final_checkpoint(result.run_dir, "round1/correct_one")
+    correction = load_correction(path)
+    assert correction is not None
+    robots = Followers(one, load_actor(path)[0], make_still_env, seed=1)
+    for number in (0, 1):
+        commands = robots.follow(correction, number).command
+        upright = (commands[:, 3:] == 0).all(dim=1)
+        assert upright.sum() == 16, "a quarter of 64"
+        assert (commands[:, :3] != 0).all()
 
 
 class SpinningToyEnv(StillToyEnv):
