@@ -6,7 +6,7 @@
 #   make results   tables and figures of docs/results from the published policy (about 25 minutes on two idle cores)
 #   make bench     throughput           make package   sdist and wheel, installed and tried in an empty folder
 #   make lowest    all tests with the lowest versions setup.py allows, in an environment of its own (.venv-lowest)
-#   make mutants   break the mathematics in 102 places, one at a time: do the tests notice? (about ten minutes)
+#   make mutants   break the mathematics in 108 places, one at a time: do the tests notice? (about ten minutes)
 #   make clean     remove what was built (never logs/)
 #
 # PYTHON names the interpreter (3.10 to 3.13). CONSTRAINTS= installs the newest allowed packages instead of the tested
@@ -67,12 +67,13 @@ PLOT = $(BIN)/eagle plot
 LATENTS ?= $(POLICY).safetensors
 
 results: $(INSTALLED)
-	rm -rf $(RESULTS)/joint $(RESULTS)/single $(RESULTS)/standing $(RESULTS)/stopping $(RESULTS)/redrawn
+	rm -rf $(RESULTS)/joint $(RESULTS)/single $(RESULTS)/standing $(RESULTS)/stopping $(RESULTS)/redrawn $(RESULTS)/upright
 	$(EVALUATE) --protocol joint --out $(RESULTS)/joint
 	$(EVALUATE) --protocol single --out $(RESULTS)/single
 	$(EVALUATE) --protocol standing --out $(RESULTS)/standing
 	$(EVALUATE) --protocol standing --resample 4 --out $(RESULTS)/stopping
 	$(EVALUATE) --protocol joint --resample 4 --out $(RESULTS)/redrawn
+	$(EVALUATE) --protocol upright --resample 4 --out $(RESULTS)/upright
 	$(PLOT) estimator $(POLICY).safetensors --envs $(RESULT_ENVS) --out $(RESULTS)
 	$(PLOT) robustness $(POLICY).safetensors --envs $(SWEEP_ENVS) --out $(RESULTS)
 	$(PLOT) bodies $(POLICY).safetensors --envs $(SWEEP_ENVS) --out $(RESULTS)
