@@ -59,7 +59,7 @@ def take_root(
         )
     was = experiment_from_plain(manifest["config"], str(source)).task
     state = load_checkpoint(source).state
-    symmetric, was_symmetric = cfg.algo.network.symmetric, bool(state["architecture"].get("mirror"))
+    symmetric, was_symmetric = cfg.algo.network.symmetric, bool(state.get("architecture", {}).get("mirror"))
     if first:
         _tell_changed_meaning(source, was, cfg.task, changes("algo.network.symmetric", was_symmetric, symmetric))
     new = clock_columns(cfg.task.observations) - clock_columns(was.observations)
@@ -67,8 +67,7 @@ def take_root(
         about = {name: manifest[name] for name in ("iteration", "env_steps", "score")}
         if first:
             state = widen_clock(state, max(new, 0))
-            sides = Sides({group: mirror()[group] for group in SIDED_GROUPS}).to_lists() if symmetric else None
-            state["architecture"]["mirror"] = sides
+            state["architecture"]["mirror"] = _sides(mirror()) if symmetric else None
             save_checkpoint(checkpoints, state, provenance, stage_end=True, **about)
         return checkpoints / f"model_{about['iteration']}.pt"
     checkpoints.mkdir(parents=True, exist_ok=True)
@@ -76,6 +75,11 @@ def take_root(
         path = source.with_suffix(suffix)
         write_atomically(checkpoints / path.name, path.read_bytes())
     return checkpoints / source.name
+
+
+def _sides(mirror: MirrorMap) -> dict[str, Any]:
+    """What the architecture of a two-sided actor says of its mirror."""
+    return Sides({group: mirror[group] for group in SIDED_GROUPS}).to_lists()
 
 
 def clock_columns(cfg: ObservationsCfg) -> int:
