@@ -46,7 +46,7 @@ class Mirror:
         """Weigh the loss with ``coef`` and evaluate it on ``fraction`` of the rows."""
         self.coef = coef
         self.fraction = fraction
-        self.sides = Sides(mirror).to(device)
+        self.sides = Sides({group: mirror[group] for group in ACTOR_INPUTS}).to(device)
         self.actions = tuple(x.to(device) for x in mirror["actions"])
 
     def __call__(self, actor: EagleActor, obs: TensorDict, log: dict[str, Tensor]) -> Tensor:

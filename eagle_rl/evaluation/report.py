@@ -78,7 +78,7 @@ def _over_seeds(values: Sequence[float | None], paper: float | None = None) -> C
 _DRAWN = {
     "single": "one command drawn, the others zero",
     "joint": "all five commands drawn",
-    "upright": "velocities drawn, height and pitch zero,",
+    "upright": "height and pitch zero, velocities drawn",
     "standing": "velocities exactly zero, height and pitch drawn",
 }
 
