@@ -14,6 +14,8 @@ import pytest
 import torch
 from hypothesis import Phase, settings
 
+from eagle_rl.models.shares import use_threads
+
 phases = [Phase.explicit, Phase.generate, Phase.shrink]
 settings.register_profile("eagle", derandomize=True, deadline=None, database=None, print_blob=False, phases=phases)
 settings.load_profile("eagle")
@@ -22,6 +24,7 @@ settings.load_profile("eagle")
 def plain_torch() -> None:
     """Set back what ``set_up_torch`` sets for a whole process."""
     torch.set_num_threads(1)
+    use_threads(1)
     if hasattr(torch.backends.mkldnn, "matmul"):  # torch 2.9 and later
         torch.backends.mkldnn.matmul.fp32_precision = "none"
 

@@ -29,7 +29,7 @@ from eagle_rl.algorithms.stopwatch import Stopwatch
 from eagle_rl.config.schema import AlgoCfg
 from eagle_rl.errors import HealthError
 from eagle_rl.models import EagleActor
-from eagle_rl.models.precision import keep_outputs_exact, multiplies_in_bfloat16
+from eagle_rl.models.precision import multiplies_in_bfloat16, prepare_for_learning
 
 MAX_SKIPPED_STEPS = 3
 """Non-finite gradients in a row after which learning stops."""
@@ -77,7 +77,7 @@ class EaglePPO(PPO):
             multi_gpu_cfg=multi_gpu_cfg,
         )
         for model in (actor, critic):
-            keep_outputs_exact(model)
+            prepare_for_learning(model)
         critic.requires_grad_(cfg.use_ppo_loss)  # imitation alone has nothing to teach it
         self.cfg = cfg
         self.is_multi_gpu = True  # makes update() call reduce_parameters(), where gradients are checked
