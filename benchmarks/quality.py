@@ -12,6 +12,7 @@ from eagle_rl.cli.environment import make_env_factory
 from eagle_rl.config.load import load_experiment
 from eagle_rl.config.schema import ExperimentCfg
 from eagle_rl.evaluation.evaluate import evaluate
+from eagle_rl.machine import own_cores
 from eagle_rl.models.precision import set_up_torch
 from eagle_rl.runners.checkpoint import latest_checkpoint
 from eagle_rl.runners.on_policy import EagleRunner, make_train_cfg
@@ -57,7 +58,7 @@ def time_to_quality(cfg: ExperimentCfg, folder: Path, minutes: float, iterations
         minutes: longest time to go on now, looked at after each check.
         iterations: between checks.
     """
-    set_up_torch(cfg.run.torch_threads)
+    set_up_torch(cfg.run.torch_threads or own_cores())
     runner = _runner(cfg, folder)
     end = time.monotonic() + 60 * minutes
     record = folder / "quality.jsonl"

@@ -244,9 +244,11 @@ class RunCfg:
     takes in the time a GPU needs to be asked for them (docs/performance.md)."""
     num_threads: int = 0
     """Physics threads; 0 takes every core, under torchrun its process's share of them."""
-    torch_threads: int = 1
-    """Threads of the learner on a CPU; 0 shares the cores out among torchrun's processes or ``--jobs``, which is a
-    quarter faster on an idle machine and up to twenty times slower on a busy one (docs/performance.md)."""
+    torch_threads: int = 0
+    """Threads of the learner on a CPU, among which rows of its networks' inputs are shared out; 0 takes every core,
+    under torchrun or ``--jobs`` the process's share of them. They sleep while they wait, so that on a busy machine
+    they are hardly slower than one. Results depend in the last digits on their number, and so with 0 on the machine;
+    never on what else runs."""
     save_interval: int = 50
     """Iterations between checkpoints."""
     keep_checkpoints: int = 3

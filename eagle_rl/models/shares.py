@@ -19,8 +19,9 @@ from torch.autograd.function import once_differentiable
 
 T = TypeVar("T")
 
-MIN_ROWS = 64
-"""Of a share: with fewer, handing them over takes as long as computing them."""
+MIN_ROWS = 128
+"""Of a share. Weights are read, and their gradients written and summed, once for each, which takes as long as up to a
+hundred rows."""
 
 
 class _Threads:

@@ -45,6 +45,7 @@ PPO = "eagle_rl/algorithms/eagle_ppo.py"
 ENV = "envs/humanoid_env.py"
 AUXILIARY = "eagle_rl/algorithms/auxiliary.py"
 ACTOR = "eagle_rl/models/actor.py"
+SHARES = "eagle_rl/models/shares.py"
 
 REWARD_TESTS = "mdp/test_rewards.py"
 LEARNER_TESTS = "learner/test_eagle_ppo.py"
@@ -272,4 +273,14 @@ MUTANTS: tuple[Mutant, ...] = (
     ),
     Mutant(TRIALS, "t >= self._cfg.settling_steps", "t > self._cfg.settling_steps", "evaluation/test_trials.py"),
     Mutant(PPO, "(last / first) ** min", "(first / last) ** min", LEARNER_TESTS),
+    Mutant(SHARES, "reduce(torch.add, same)", "same[0]", "learner/test_shares.py"),
+    Mutant(
+        SHARES,
+        "own[i] if i in own else future.result()",
+        "own[i] if i in own else own[max(own)]",
+        "learner/test_shares.py",
+    ),
+    Mutant(
+        SHARES, 'torch.autocast("cpu", dtype, mixed,', 'torch.autocast("cpu", dtype, False,', "learner/test_shares.py"
+    ),
 )

@@ -76,7 +76,7 @@ def toy_experiment(iterations: int = 3, judge_envs: int = 4, **plan: object) -> 
         search=SearchCfg(num_pairs=4, num_steps=5, settling_steps=1, resampling_time_s=0.04),
         correction=CorrectionCfg(num_envs=4, num_steps=12, settling_steps=2),
         evaluation=EvaluationCfg(num_steps=5),
-        run=RunCfg(save_interval=1, torch_threads=1),  # forked processes cannot use threads of their parent
+        run=RunCfg(save_interval=1),
     )
 
 
