@@ -41,8 +41,8 @@ class _Threads:
     def map(self, do: Callable[[Any], T], tasks: Iterable[Any]) -> list[T]:
         """What ``do`` returns for each task, in their order; what it raises for one is raised when all are over.
 
-        The caller begins with the last and takes what nobody else has begun, so that it never waits for a thread that
-        a busy machine leaves without a core.
+        The caller begins with the last and takes what nobody else has begun, so that it does not wait for a thread to
+        which a busy machine has yet to give a core.
         """
         waiting = list(tasks)
         futures = [self._helpers().submit(do, task) for task in waiting]

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from eagle_rl.models import shares
 from eagle_rl.models.precision import keep_outputs_exact, set_up_torch
 from eagle_rl.models.shares import MIN_ROWS, SharedMLP, use_threads
-from tests.learner.helpers import collect, make_runner
+from tests.learner.helpers import collect, make_runner, parameters
 from tests.toy import ToyEnv
 
 INPUTS, OUTPUTS = 7, 3
@@ -275,3 +275,15 @@ def test_the_gradient_of_an_update_with_two_threads_is_that_with_one(algo, monke
         gradients.append({name: grad.clone() for name, grad in named.items() if grad is not None})
     assert set(shared_out) == {2}, "nothing was shared out, so the test shows nothing"
     require_alike(gradients[1], gradients[0], 0.03 if "precision" in algo else 1e-4)
+
+
+def test_a_resumed_run_with_two_threads_equals_the_uninterrupted_one_bit_for_bit(tmp_path):
+    use_threads(2)
+    whole = make_runner(env=ToyEnv(2 * MIN_ROWS))
+    whole.learn(4)
+    saved = make_runner(tmp_path, ToyEnv(2 * MIN_ROWS)).learn(2)
+    resumed = make_runner(tmp_path, ToyEnv(2 * MIN_ROWS))
+    resumed.load(saved)
+    resumed.learn(2)
+    expected, found = parameters(whole), parameters(resumed)
+    assert [name for name in expected if not torch.equal(found[name], expected[name])] == [], "learned otherwise"
