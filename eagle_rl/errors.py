@@ -43,6 +43,12 @@ class CheckpointError(EagleError, ValueError):
     exit_code = 5
 
 
+class CompileError(EagleError, RuntimeError):
+    """What was to be compiled is not, for want of a compiler or because of it; the message says why."""
+
+    exit_code = 6
+
+
 class Interrupted(KeyboardInterrupt):
     """A run was asked to stop, finished its iteration and saved; the message says where."""
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from .geometry import from_yaw_frame, heading_of
+from .recording import Attributes
 from .rng import CounterRng
 from .sim.height_field import HeightField
 from .sim.terrain import Terrain
@@ -29,6 +31,11 @@ _FOOTPRINT = 0.25
 
 class Plane:
     """Flat ground at height zero, without levels."""
+
+    ATTRIBUTES: ClassVar[Attributes] = ((), ())
+    """Paths, from the environment, of what :meth:`judge` reads and writes (``envs.recording``)."""
+    has_levels: ClassVar[bool] = False
+    """Whether environments move between levels when an episode ends, by :meth:`advance`."""
 
     def __init__(self, scan_points: Tensor) -> None:
         """Measure at these points of the yaw frame [m], shape (P, 2)."""
@@ -109,6 +116,8 @@ class Surface:
 class UnevenGround(Plane):
     """Patches of growing difficulty; robots that walk well meet harder ones (HugWBC 8, without its joint condition)."""
 
+    ATTRIBUTES: ClassVar[Attributes] = (("ground._sums", "ground._steps"), ("ground._sums", "ground._steps"))
+    has_levels = True
     _STATE = ("level", "_sums", "_steps")
 
     def __init__(

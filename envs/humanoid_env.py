@@ -15,31 +15,21 @@ from torch import Tensor
 
 from eagle_rl.config.schema import TaskCfg
 
+from .control_step import ControlStep, compile_step
 from .ground import make_ground
 from .mdp.active_commands import ActiveCommands
-from .mdp.aids import LearningAids, harness_damping, harness_wrench
+from .mdp.aids import LearningAids, harness_damping
 from .mdp.commands import CommandSampler
 from .mdp.curriculum import penalty_scale
-from .mdp.gait import advance_phase, foot_phases
-from .mdp.layout import SENSED_SIZE
-from .mdp.metrics import contact_match, measured_commands, tracking_errors
 from .mdp.observations import (
     History,
     ObservationLayout,
-    clock_observation,
-    command_observation,
-    critic_observation,
-    delay,
-    estimation_target,
     noise_scale,
-    proprioception,
     scan_points,
 )
 from .mdp.posture import make_posture
 from .mdp.randomization import Randomizer
-from .mdp.rewards import RewardContext, compute_rewards, success_scores
-from .mdp.terminations import terminations
-from .measure import measured
+from .mdp.rewards import reward_factors
 from .pooling import pool_robots, share
 from .rng import CounterRng
 from .robots.embodiment import pooled_embodiment
@@ -47,16 +37,14 @@ from .robots.model import build_model
 from .robots.slots import NUM_SLOTS
 from .robots.spec import RobotSpec
 from .sim.batch import RobotBatch
-from .sim.health import MAX_ACTION
 from .sim.pool import PhysicsPool
 from .sim.terrain import Terrain, build_terrain
-from .state import PooledState
 from .step_log import StepLog, episode_ratio
 
 Pooling = Literal["mean", "max"]
 
 
-class HumanoidEnv(VecEnv):
+class HumanoidEnv(ControlStep, VecEnv):
     """Whole-body command tracking by a mixed fleet of humanoids.
 
     Actions, observations, rewards and terminations are computed once over the pool, in slot space.
@@ -136,7 +124,7 @@ class HumanoidEnv(VecEnv):
         )
         self.layout = ObservationLayout(observations)
         self.mirror = self.layout.mirror(self.device)
-        self._noise = noise_scale(observations, self.robots)
+        self._noise, self._noise_keys = noise_scale(observations, self.robots), self.rng.keys("observation_noise")
 
     def _allocate(self, dtype: torch.dtype) -> None:
         """Buffers that outlive a step."""
@@ -144,15 +132,17 @@ class HumanoidEnv(VecEnv):
         self._live = self.robots.slot_mask > 0
         self._all = torch.arange(n, device=device)
         self.common_step_counter = 0
+        self._step_count = torch.zeros((), dtype=torch.long, device=device)
         self.episode_length_buf = torch.zeros(n, dtype=torch.long, device=device)
         self.episode_count = torch.zeros(n, dtype=torch.long, device=device)
         self.phase = torch.zeros(n, dtype=dtype, device=device)
         zeros = torch.zeros(n, NUM_SLOTS, dtype=dtype, device=device)
         self._actions = self._last_actions = self._last_last_actions = self._last_joint_vel = zeros
         self._last_contact = torch.zeros(n, 2, dtype=torch.bool, device=device)
-        self._staged = self.pool.staged()
-        self.state = self._derive()
-        self._last_frame = proprioception(self.state, self.robots, self.task.observations)
+        self._staged, self._causes = self.pool.staged(), self.pool.causes()
+        self._reward_factors = self._weigh()
+        self._forget()
+        (self._last_frame,) = self._sense()
         self.history = History(n, self.task.observations.history_length, self._last_frame)
 
     # --- the step -----------------------------------------------------------------------------------------------------
@@ -169,34 +159,30 @@ class HumanoidEnv(VecEnv):
             physics took [s] (``physics_time``), and ``final_observations`` of the environments ``final_ids``, whose
             returns are to end there and be bootstrapped: they timed out, or get a new command or a push next.
         """
-        self._last_joint_vel, self._last_contact = self.state.joint_vel, self.state.foot_contact
-        self._physics_step(self._act(actions))
+        self._physics_step(*self._aim(actions))
         self.common_step_counter += 1
-        self.episode_length_buf = self.episode_length_buf + 1
-        self.phase = advance_phase(self.phase, self.step_dt, self.robots.gait_frequency)
+        self._step_count.fill_(self.common_step_counter)
+        self._causes = self.pool.causes()
+        self._reward_factors = self._weigh()
+        self._forget()
+        judged = self._judge()
+        dones, time_outs, self._groups = judged.dones, judged.time_outs, judged.groups
+        self.commands.judge(judged.scores)
 
-        causes = self.pool.causes()
-        sick = causes > 0
-        self.state = self._derive()
-        reasons = terminations(self.state, self.task.terminations)
-        fallen = torch.stack(list(reasons.values())).any(dim=0) & ~sick
-        over = (self.episode_length_buf >= self.max_episode_length) | self.ground.left(self.state.root_pos_w)
-        time_outs = over & ~(fallen | sick)
-        dones = fallen | sick | time_outs
-        rewards, terms = self._rewards(fallen)
-        rewards = rewards.masked_fill(sick, 0.0)
-
-        self._observe()
         cut = dones if self.final_of_episodes else time_outs | (self._about_to_be_surprised() & ~dones)
         final_ids = cut.nonzero().squeeze(1)
         extras: dict[str, Any] = {"time_outs": time_outs, "final_ids": final_ids, "physics_time": self._physics_time}
         extras["final_observations"] = self.get_observations()[final_ids] if len(final_ids) else self._no_observations
-        extras["log"] = self._account(terms, reasons, causes, dones, time_outs)
+        extras["log"] = self._account(judged.log_rows)
         reset_ids = dones.nonzero().squeeze(1)
         if len(reset_ids):
-            self._reset(reset_ids, fallen[reset_ids])
+            self._reset(reset_ids, judged.fallen[reset_ids])
         self._resample()
-        return self.get_observations(), rewards.float(), dones, extras
+        return self.get_observations(), judged.rewards, dones, extras
+
+    def compile(self) -> None:
+        """From now on compute steps by compiled kernels, equal up to rounding; see :func:`compile_step`."""
+        compile_step(self)
 
     def reset(self) -> None:
         """Start new episodes everywhere; random streams go on."""
@@ -204,36 +190,16 @@ class HumanoidEnv(VecEnv):
 
     def get_observations(self) -> TensorDict:
         """Observation groups at the present state, fresh tensors."""
-        cfg, state, friction = self.task.observations, self.state, self.task.randomization.friction
-        groups = {
-            "history": self.history.flat,
-            "command": command_observation(state, cfg),
-            "clock": clock_observation(state, cfg),
-            "critic": critic_observation(self._last_frame, state, self.robots, self.embodiment, cfg, friction),
-            "estimate": estimation_target(state, self.embodiment, cfg),
-            "slot_mask": self.robots.slot_mask,
-            "phase": self.phase,
-        }
-        tensors = {name: value.float() for name, value in groups.items()}
+        if self._groups is None:
+            self._groups = self._derive_groups()
+        own = {"history": self.history.flat, "slot_mask": self.robots.slot_mask, "phase": self.phase}
+        tensors = {name: value.float() for name, value in own.items()} | self._groups._asdict()
         return TensorDict(tensors | {"robot": self.robots.robot_id}, batch_size=[self.num_envs])
-
-    @property
-    def command(self) -> Tensor:
-        """Commands in force (v_x, v_y, omega, h, p), shape (N, 5)."""
-        return self.commands.command
-
-    def tracking_errors(self) -> Tensor:
-        """Absolute error of each command at the last step [m/s, m/s, rad/s, m, rad], shape (N, 5)."""
-        return tracking_errors(self.state, self.robots)
-
-    def measured_commands(self) -> Tensor:
-        """What each command asks for, as it is now [m/s, m/s, rad/s, m, rad], shape (N, 5)."""
-        return measured_commands(self.state, self.robots)
 
     def pin_commands(self, command: Tensor | None) -> None:
         """Hold these commands, shape (N, 5), instead of sampling; ``None`` returns to sampling at the next draw."""
         self.commands.pin(command)
-        self.commands.show(self.state, self.phase, self.task.gait)
+        self._forget()
 
     @property
     def penalty_scale(self) -> float:
@@ -256,20 +222,13 @@ class HumanoidEnv(VecEnv):
         due = self.commands.due()
         return torch.ones_like(due) if self.randomizer.pushes_at(self.common_step_counter, self.step_dt) else due
 
-    def _act(self, actions: Tensor) -> Tensor:
-        """Remember the actions and turn them into canonical PD targets [rad], (N, 32); NaN where one is absurd."""
-        clip, live = self.task.control.action_clip, self._live
-        sound = actions.abs() <= MAX_ACTION
-        self._last_last_actions, self._last_actions = self._last_actions, self._actions
-        self._actions = torch.where(live & sound, actions.to(self._actions.dtype).clamp(-clip, clip), 0.0)
-        targets = self.posture.advance(self.command) + self.robots.action_scale * self._actions
-        absurd = (live & ~sound).any(dim=1, keepdim=True)
-        return (targets + self.randomizer.motor_offset).masked_fill(absurd, torch.nan)
+    def _weigh(self) -> Tensor:
+        """Factor on each reward term in this step, shape (T, 1)."""
+        return reward_factors(self.task.rewards.weights, self.penalty_scale, self.step_dt, self.phase)
 
-    def _physics_step(self, targets: Tensor) -> None:
+    def _physics_step(self, targets: Tensor, wrench: Tensor | None) -> None:
         """Push, help and step every robot."""
         self.randomizer.push(self.common_step_counter, self.penalty_scale, self.step_dt)
-        wrench = None if self._harness is None else harness_wrench(self.state, self.robots, self._harness)
         start = time.perf_counter()
         self._staged = self.pool.step(targets, wrench)
         self._physics_time = time.perf_counter() - start
@@ -283,51 +242,11 @@ class HumanoidEnv(VecEnv):
         if self.task.aids.harness > 0:
             self.pool.set_base_damping(harness_damping(self.robots, harness))
 
-    def _derive(self) -> PooledState:
-        """Turn the staging rows into the pooled state, with the command, phase and actions now in force."""
-        physical, standing = measured(self._staged, self.pool.columns), self.commands.standing
-        return PooledState(
-            **physical,
-            **self.ground.measure(physical["root_pos_w"], physical["root_quat_w"], physical["foot_pos_w"]),
-            joint_acc=(physical["joint_vel"] - self._last_joint_vel) / self.step_dt,
-            last_foot_contact=self._last_contact,
-            friction=self.randomizer.friction,
-            command=self.command,
-            standing=standing,
-            foot_phase=foot_phases(self.phase, standing, self.task.gait),
-            actions=self._actions,
-            last_actions=self._last_actions,
-            last_last_actions=self._last_last_actions,
-        )
-
-    def _rewards(self, terminated: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """Rewards of the step; also advances what the next step compares itself with."""
-        context = RewardContext(
-            cfg=self.task.rewards,
-            gait=self.task.gait,
-            gait_shaping=self._gait_shaping,
-            terminated=terminated,
-        )
-        rewards, terms = compute_rewards(self.state, self.robots, context, self.penalty_scale, self.step_dt)
-        scores = success_scores(self.state, self.robots, context)
-        self.commands.judge(scores)
-        self.ground.judge(scores[0], self.state)
-        return rewards, terms
-
-    def _observe(self) -> None:
-        """Push the frame of the present state, delayed and corrupted, into the history."""
-        frame = proprioception(self.state, self.robots, self.task.observations)
-        sensed = delay(frame, self._last_frame, self.randomizer.latency)
-        if self.task.observations.enable_corruption:
-            u = self.rng.uniform_in(-1.0, 1.0, "observation_noise", self.common_step_counter, SENSED_SIZE)
-            sensed[:, :SENSED_SIZE].addcmul_(u.to(frame.dtype), self._noise[:, :SENSED_SIZE])
-        self._last_frame = frame
-        self.history.push(sensed)
-
     def _reset(self, ids: Tensor, fallen: Tensor) -> None:
         """Start new episodes, some of them, bool (n,), after a fall; other environments are untouched, bit for bit."""
         count = self.episode_count[ids]
-        self.ground.advance(ids, count, self.state, self.episode_length_buf)
+        if self.ground.has_levels:
+            self.ground.advance(ids, count, self.state, self.episode_length_buf)
         self.randomizer.reset(ids, count, self.step_dt)
         root, joint_pos, joint_vel = self.randomizer.initial_state(ids, count)
         staged = self.pool.reset(ids, self.ground.place(ids, count, root), joint_pos, joint_vel)
@@ -340,8 +259,8 @@ class HumanoidEnv(VecEnv):
             setattr(self, name, getattr(self, name).index_fill(0, ids, 0))
         self._last_joint_vel = self._last_joint_vel.index_copy(0, ids, staged[:, self.pool.columns["joint_vel"]])
         self._staged = self._staged.index_copy(0, ids, staged)
-        self.state = self._derive()
-        self._last_frame = proprioception(self.state, self.robots, self.task.observations)
+        self._forget()
+        (self._last_frame,) = self._sense()
         self.history.reset(ids, self._last_frame[ids])
 
     def _resample(self) -> None:
@@ -349,15 +268,11 @@ class HumanoidEnv(VecEnv):
         ids = self.commands.due().nonzero().squeeze(1)
         if len(ids):
             self.commands.draw(ids)
-            self.commands.show(self.state, self.phase, self.task.gait)
+            self._forget()
 
-    def _account(
-        self, terms: dict[str, Tensor], reasons: dict[str, Tensor], causes: Tensor, dones: Tensor, time_outs: Tensor
-    ) -> dict[str, Tensor | float]:
+    def _account(self, log_rows: Tensor) -> dict[str, Tensor | float]:
         """Add the step to the log and the aids; returns tags and values now and then."""
-        match = contact_match(self.state, self.task.gait)
-        falls = dones & ~time_outs
-        self.step_log.add(terms, reasons, causes, self.tracking_errors(), match, falls, dones, self.state.standing)
+        self.step_log.add(log_rows)
         if self.common_step_counter % self.task.aids.interval_steps:
             return {}
         entry, falls_per_step, match_per_robot = self.step_log.flush()
@@ -397,4 +312,4 @@ class HumanoidEnv(VecEnv):
             getattr(self, name).load_state_dict(state[name])
         self._apply_aids()
         self._staged = self.pool.staged()
-        self.state = self._derive()
+        self._forget()

@@ -50,20 +50,20 @@ class CounterRng:
         self._stream_keys: dict[str, Tensor] = {}
         self._columns: dict[int, Tensor] = {}
 
-    def uniform(self, stream: str, count: Tensor | int, size: int, ids: Tensor | None = None) -> Tensor:
+    def uniform(self, stream: str | Tensor, count: Tensor | int, size: int, ids: Tensor | None = None) -> Tensor:
         """Numbers uniform in [0, 1).
 
         Args:
-            stream: name of what is drawn; different names are independent.
+            stream: name of what is drawn, or its :meth:`keys`; different names are independent.
             count: how often this was drawn before, the coordinate that makes draws differ: int64, shape (n,), or one
-                number for all.
+                number or scalar tensor for all.
             size: numbers per environment.
             ids: environments, shape (n,), or None for all.
 
         Returns:
             Float32 tensor, shape (n, size); 24 random bits each.
         """
-        key = self._stream_key(stream)
+        key = self.keys(stream) if isinstance(stream, str) else stream
         key = key if ids is None else key[ids]
         key = key + (_times_golden(count) if isinstance(count, int) else count * _GOLDEN)
         words = _mix(key.unsqueeze(1) + self._column_keys(size)).view(torch.int32)  # two numbers a hash
@@ -73,7 +73,7 @@ class CounterRng:
         self,
         low: float | Tensor,
         high: float | Tensor,
-        stream: str,
+        stream: str | Tensor,
         count: Tensor | int,
         size: int,
         ids: Tensor | None = None,
@@ -81,8 +81,8 @@ class CounterRng:
         """Numbers uniform in [low, high), shape (n, size)."""
         return low + (high - low) * self.uniform(stream, count, size, ids)
 
-    def _stream_key(self, stream: str) -> Tensor:
-        """One key per environment for a stream, derived at its first use, shape (N,)."""
+    def keys(self, stream: str) -> Tensor:
+        """One key per environment for a stream, derived at its first use, int64, shape (N,)."""
         if stream not in self._stream_keys:
             self._stream_keys[stream] = _mix(self.key + _times_golden(zlib.crc32(stream.encode())))
         return self._stream_keys[stream]

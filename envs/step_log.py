@@ -36,7 +36,7 @@ class StepLog:
         self._columns: list[str] = []
         self._steps = 0
 
-    def add(
+    def rows(
         self,
         terms: dict[str, Tensor],
         reasons: dict[str, Tensor],
@@ -46,8 +46,8 @@ class StepLog:
         falls: Tensor,
         dones: Tensor,
         standing: Tensor,
-    ) -> None:
-        """Add one step.
+    ) -> Tensor:
+        """What :meth:`add` takes of one step, float64, shape (N, columns).
 
         Args:
             terms: weighted reward terms by name, shape (N,) each.
@@ -73,7 +73,10 @@ class StepLog:
             errors,
             torch.stack((contact_match.masked_fill(standing, 0.0), ~standing, falls, dones), dim=1),
         )
-        rows = torch.cat(blocks, dim=1).double()
+        return torch.cat(blocks, dim=1).double()
+
+    def add(self, rows: Tensor) -> None:
+        """Add one step's :meth:`rows`."""
         if self._sums is None:
             self._sums = rows.new_zeros(len(self._names), rows.shape[1])
         self._sums = self._sums.index_add(0, self._robot_id, rows)

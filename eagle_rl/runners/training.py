@@ -25,6 +25,7 @@ from eagle_rl.runners.checkpoint import (
     save_checkpoint,
 )
 from eagle_rl.runners.compass import DemonstrationEnv, ResidualBank, ResidualEnv, ResidualPolicy, begin_residual
+from eagle_rl.runners.compiling import compile_where_it_pays
 from eagle_rl.runners.correcting import CorrectionRunner
 from eagle_rl.runners.files import patiently
 from eagle_rl.runners.on_policy import EagleRunner, make_train_cfg
@@ -144,6 +145,7 @@ def _make_runner(job: Job) -> EagleRunner:
     """The runner of a stage, its specialists loaded."""
     cfg, stage = job.cfg, job.stage
     env: VecEnv = job.make_env(stage.robots, cfg.num_envs, cfg.task, stage.seed + job.rank)
+    compile_where_it_pays(env, cfg.run, stage.env_steps, stage.name)
     acting_base = _load(job.base, cfg.run.env_device)
     history = cfg.task.observations.history_length
     if stage.demonstrations:

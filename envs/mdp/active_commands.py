@@ -5,11 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from eagle_rl.config.schema import GaitCfg
-
-from ..state import PooledState
 from .commands import CommandSampler
-from .gait import foot_phases
 
 
 class ActiveCommands:
@@ -61,20 +57,15 @@ class ActiveCommands:
             self.sampler.spoil(ids[fallen])
             self.draw(ids[~fallen])
 
-    def judge(self, scores: tuple[Tensor, Tensor, Tensor, Tensor]) -> None:
-        """Credit one step to the windows of the sampled commands, see ``rewards.success_scores``."""
+    def judge(self, scores: Tensor) -> None:
+        """Credit one step to the windows of the sampled commands, see ``rewards.success_scores``, shape (N, 4)."""
         self.age += 1
         if self._pinned is None:
-            self.sampler.accumulate(*scores)
+            self.sampler.accumulate(scores)
 
     def due(self) -> Tensor:
         """Whether each environment's command has been in force for its time, bool, shape (N,)."""
         return self.age >= self._interval
-
-    def show(self, state: PooledState, phase: Tensor, gait: GaitCfg) -> None:
-        """Let a state, and so the next observation, show the commands now in force."""
-        state.command, state.standing = self.command, self.standing
-        state.foot_phase = foot_phases(phase, state.standing, gait)
 
     def log(self) -> dict[str, float]:
         """How far the curriculum has come."""

@@ -92,15 +92,9 @@ class CommandSampler:
         self._creditable = torch.zeros(num_envs, dtype=torch.bool, device=device)
         self._sums = torch.zeros(num_envs, 4, dtype=torch.float64, device=device)
 
-    def accumulate(
-        self,
-        lin_vel_reward_ratio: Tensor,
-        ang_vel_ratio: Tensor,
-        contact_force_score: Tensor,
-        contact_vel_score: Tensor,
-    ) -> None:
-        """Add one step's success quantities, each 1 at best, shape (N,) (see ``rewards.success_scores``)."""
-        self._sums += torch.stack((lin_vel_reward_ratio, ang_vel_ratio, contact_force_score, contact_vel_score), dim=1)
+    def accumulate(self, scores: Tensor) -> None:
+        """Add one step's success quantities, each 1 at best, shape (N, 4) (see ``rewards.success_scores``)."""
+        self._sums += scores
 
     def sample(self, ids: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
         """Close the windows of some environments and draw their next commands.

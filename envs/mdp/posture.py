@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 import torch
@@ -12,6 +12,7 @@ from torch import Tensor
 
 from eagle_rl.config.schema import ControlCfg
 
+from ..recording import Attributes
 from ..robots.posture import HEIGHTS, PITCHES, POSTURE_SLOTS, posture_table
 from ..robots.spec import RobotSpec
 from ..state import PooledRobots
@@ -19,6 +20,9 @@ from ..state import PooledRobots
 
 class RestingPose(Protocol):
     """Where the PD targets are while the actions are zero."""
+
+    ATTRIBUTES: ClassVar[Attributes]
+    """Paths, from the environment, of what :meth:`advance` reads and writes (``envs.recording``)."""
 
     def advance(self, command: Tensor) -> Tensor:
         """The pose of this control step under the commands (N, 5), canonical [rad], (N, 32)."""
@@ -55,6 +59,8 @@ def left_over(cfg: ControlCfg, step_dt: float) -> float:
 class DefaultPose:
     """The default pose, whatever is commanded (paper)."""
 
+    ATTRIBUTES: ClassVar[Attributes] = (("posture._default",), ())
+
     def __init__(self, default: Tensor) -> None:
         """Rest in ``default``, canonical [rad], (N, 32)."""
         self._default = default
@@ -80,6 +86,11 @@ class BentPose:
     A policy then walks about a bent pose instead of having to learn the kinematics of a squat. The command is followed
     with a lag of the first order, so that a new one is no blow to the joints.
     """
+
+    ATTRIBUTES: ClassVar[Attributes] = (
+        ("posture.followed", "posture._default", "posture._robot"),
+        ("posture.followed",),
+    )
 
     def __init__(self, cfg: ControlCfg, specs: Sequence[RobotSpec], robots: PooledRobots, step_dt: float) -> None:
         """Start in the default pose; see :func:`make_posture`."""

@@ -271,7 +271,7 @@ REWARD_TERMS: dict[str, RewardTerm] = {
 
 
 def compute_rewards(
-    state: PooledState, robots: PooledRobots, ctx: RewardContext, penalty_scale: float, step_dt: float
+    state: PooledState, robots: PooledRobots, ctx: RewardContext, factors: Tensor
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Weighted reward of one control step, ``sum(weight * dt * term)`` (HugWBC 0.1).
 
@@ -279,8 +279,7 @@ def compute_rewards(
         state: state after the step.
         robots: constants of each environment's robot.
         ctx: configuration and learning aids of this step.
-        penalty_scale: k, factor on the terms of the penalty curriculum [-].
-        step_dt: control step [s].
+        factors: weight * dt of each term of non-zero weight, see :func:`reward_factors`.
 
     Returns:
         The reward, shape (N,), and its weighted terms by name, each (N,); terms of zero weight are absent.
@@ -294,8 +293,20 @@ def compute_rewards(
     if not values:
         return torch.zeros_like(state.base_height), {}
     unweighted = torch.stack(list(values.values()))
-    weighted = unweighted * _factors(ctx.cfg.weights, penalty_scale, step_dt, unweighted.dtype, unweighted.device)
+    weighted = unweighted * factors
     return weighted.sum(dim=0), dict(zip(values, weighted.unbind(), strict=True))
+
+
+def reward_factors(weights: RewardWeightsCfg, penalty_scale: float, step_dt: float, like: Tensor) -> Tensor:
+    """Factor on each term of non-zero weight, in the order of ``REWARD_TERMS``, shape (T, 1).
+
+    Args:
+        weights: of the terms.
+        penalty_scale: k, factor on the terms of the penalty curriculum [-].
+        step_dt: control step [s].
+        like: tensor of the dtype and on the device that are wanted.
+    """
+    return _factors(weights, penalty_scale, step_dt, like.dtype, like.device)
 
 
 @lru_cache(maxsize=4)

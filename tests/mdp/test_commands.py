@@ -33,7 +33,7 @@ def track(s: CommandSampler, steps: int = WINDOW, **scores: float) -> None:
     """Accumulate a window; by default every score is just above its threshold."""
     values = {"lin_vel": 0.81, "ang_vel": 0.41, "force": 0.81, "vel": 0.81} | scores
     for _ in range(steps):
-        s.accumulate(*(torch.full((len(s.robot_id),), value) for value in values.values()))
+        s.accumulate(torch.tensor(list(values.values())).expand(len(s.robot_id), -1))
 
 
 @settings(max_examples=15, deadline=None)

@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from eagle_rl.config.schema import GaitCfg, ObservationsCfg, RewardsCfg, RewardWeightsCfg
-from envs.mdp.rewards import REWARD_TERMS, RewardContext, compute_rewards, success_scores
+from envs.mdp.rewards import REWARD_TERMS, RewardContext, compute_rewards, reward_factors, success_scores
 from envs.mdp.symmetry import mirror_state
 from envs.robots.slots import SLOT_INDEX
-from envs.state import PooledState
+from envs.state import PooledRobots, PooledState
 from tests.states import quiet_state, random_robots, random_state
 
 DT = 0.02
@@ -64,6 +64,12 @@ def context(shaping: float = 0.0, terminated: bool = False, **cfg: Any) -> Rewar
         gait_shaping=torch.full((N,), shaping, dtype=torch.float64),
         terminated=torch.full((N,), terminated),
     )
+
+
+def weighted(
+    state: PooledState, robots: PooledRobots, ctx: RewardContext, k: float
+) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+    return compute_rewards(state, robots, ctx, reward_factors(ctx.cfg.weights, k, DT, state.joint_pos))
 
 
 def state_with(**rows: Any) -> PooledState:
@@ -292,14 +298,14 @@ def test_joint_limits_measure_radians_beyond_the_soft_limits() -> None:
 
 
 def test_a_fall_costs_four_once() -> None:
-    _, terms = compute_rewards(state_with(), ROBOTS, context(terminated=True), 1.0, DT)
+    _, terms = weighted(state_with(), ROBOTS, context(terminated=True), 1.0)
     assert terms["termination"].tolist() == pytest.approx([-4.0] * N)
     assert terms["alive"].tolist() == pytest.approx([0.004] * N)
 
 
 def test_total_is_the_weighted_sum_over_the_control_step() -> None:
     state, k, ctx = random_state(1, ROBOTS), 0.2, context()
-    total, terms = compute_rewards(state, ROBOTS, context(), k, DT)
+    total, terms = weighted(state, ROBOTS, context(), k)
     expected = {
         name: weight * DT * (k if name in PENALTY_CURRICULUM else 1) * REWARD_TERMS[name].function(state, ROBOTS, ctx)
         for name, weight in (PRINTED_TABLE | INHERITED).items()
@@ -312,17 +318,17 @@ def test_total_is_the_weighted_sum_over_the_control_step() -> None:
 
 def test_terms_of_zero_weight_are_left_out() -> None:
     weights = RewardWeightsCfg(**{f.name: 0.0 for f in fields(RewardWeightsCfg) if f.name != "alive"})
-    total, terms = compute_rewards(state_with(), ROBOTS, context(weights=weights), 1.0, DT)
+    total, terms = weighted(state_with(), ROBOTS, context(weights=weights), 1.0)
     assert list(terms) == ["alive"]
     assert total.tolist() == pytest.approx([0.004] * N)
-    nothing, _ = compute_rewards(state_with(), ROBOTS, context(weights=replace(weights, alive=0.0)), 1.0, DT)
+    nothing, _ = weighted(state_with(), ROBOTS, context(weights=replace(weights, alive=0.0)), 1.0)
     assert nothing.tolist() == [0.0] * N
 
 
 def test_gait_shaping_scales_the_gait_terms_alone() -> None:
     state = random_state(2, ROBOTS)
-    _, plain = compute_rewards(state, ROBOTS, context(), 1.0, DT)
-    _, shaped = compute_rewards(state, ROBOTS, context(shaping=0.5), 1.0, DT)
+    _, plain = weighted(state, ROBOTS, context(), 1.0)
+    _, shaped = weighted(state, ROBOTS, context(shaping=0.5), 1.0)
     changed = {name for name in plain if not torch.equal(plain[name], shaped[name])}
     assert changed == {"foot_swing", "contact_vel", "contact_force"}
     assert torch.allclose(shaped["contact_vel"], 2.0 * plain["contact_vel"])
@@ -354,9 +360,9 @@ def test_every_term_is_the_same_in_the_mirror(seed: int, orientation: str) -> No
 def test_absent_slots_change_nothing(seed: int) -> None:
     robots = random_robots(seed)
     state = random_state(seed, robots)
-    before, _ = compute_rewards(state, robots, context(), 1.0, DT)
+    before, _ = weighted(state, robots, context(), 1.0)
     absent = 1.0 - robots.slot_mask
     for name in ("joint_pos", "joint_vel", "joint_acc", "joint_torque", "actions", "last_actions", "last_last_actions"):
         setattr(state, name, getattr(state, name) + 7.0 * absent)
-    after, _ = compute_rewards(state, robots, context(), 1.0, DT)
+    after, _ = weighted(state, robots, context(), 1.0)
     assert torch.equal(before, after)

@@ -1,0 +1,261 @@
+"""The arithmetic of a control step: what its parts return, and what they read and write when they are compiled."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from eagle_rl.config.schema import TaskCfg
+
+from .ground import Plane
+from .mdp.active_commands import ActiveCommands
+from .mdp.aids import harness_wrench
+from .mdp.gait import advance_phase, foot_phases
+from .mdp.layout import SENSED_SIZE
+from .mdp.metrics import contact_match, measured_commands, tracking_errors
+from .mdp.observations import (
+    History,
+    clock_observation,
+    command_observation,
+    critic_observation,
+    delay,
+    estimation_target,
+    proprioception,
+)
+from .mdp.posture import RestingPose
+from .mdp.randomization import Randomizer
+from .mdp.rewards import RewardContext, compute_rewards, success_scores
+from .mdp.terminations import terminations
+from .measure import measured
+from .recording import Recording
+from .rng import CounterRng
+from .sim.health import MAX_ACTION
+from .sim.pool import PhysicsPool
+from .state import PooledRobots, PooledState
+from .step_log import StepLog
+
+
+class Judgement(NamedTuple):
+    """What came of a control step."""
+
+    rewards: Tensor
+    """Float32, shape (N,)."""
+    dones: Tensor
+    """Whether the episode ended, bool, shape (N,)."""
+    time_outs: Tensor
+    """Whether it ended by its time limit alone, bool, shape (N,)."""
+    fallen: Tensor
+    """Whether it ended by a fall, bool, shape (N,)."""
+    scores: Tensor
+    """See ``rewards.success_scores``, shape (N, 4)."""
+    log_rows: Tensor
+    """See ``StepLog.rows``."""
+    command: Tensor
+    clock: Tensor
+    critic: Tensor
+    estimate: Tensor
+
+    @property
+    def groups(self) -> DerivedGroups:
+        """Observations of the state the step led to."""
+        return DerivedGroups(self.command, self.clock, self.critic, self.estimate)
+
+
+class DerivedGroups(NamedTuple):
+    """Observation groups that are worked out from the state, float32, see ``ObservationLayout``."""
+
+    command: Tensor
+    clock: Tensor
+    critic: Tensor
+    estimate: Tensor
+
+
+class ControlStep:
+    """What a control step does besides physics, all of it arithmetic on tensors of the pool.
+
+    Its parts neither branch on values nor count, so that they can be compiled; a part reads and writes what
+    ``_PARTS`` says.
+    """
+
+    task: TaskCfg
+    step_dt: float
+    max_episode_length: int
+    device: torch.device
+    pool: PhysicsPool
+    rng: CounterRng
+    randomizer: Randomizer
+    robots: PooledRobots
+    commands: ActiveCommands
+    posture: RestingPose
+    ground: Plane
+    step_log: StepLog
+    embodiment: Tensor | None
+    history: History
+    episode_length_buf: Tensor
+    phase: Tensor
+    _staged: Tensor
+    _causes: Tensor
+    _live: Tensor
+    _step_count: Tensor
+    _harness: Tensor | None
+    _gait_shaping: Tensor
+    _reward_factors: Tensor
+    _noise: Tensor
+    _noise_keys: Tensor
+    _last_frame: Tensor
+    _actions: Tensor
+    _last_actions: Tensor
+    _last_last_actions: Tensor
+    _last_joint_vel: Tensor
+    _last_contact: Tensor
+    _state: PooledState | None
+    _groups: DerivedGroups | None
+
+    @property
+    def state(self) -> PooledState:
+        """What every robot did in the last step, under the command now in force; worked out when it is asked for."""
+        if self._state is None:
+            self._state = self._derive()
+        return self._state
+
+    @property
+    def command(self) -> Tensor:
+        """Commands in force (v_x, v_y, omega, h, p), shape (N, 5)."""
+        return self.commands.command
+
+    def tracking_errors(self) -> Tensor:
+        """Absolute error of each command at the last step [m/s, m/s, rad/s, m, rad], shape (N, 5)."""
+        return tracking_errors(self.state, self.robots)
+
+    def measured_commands(self) -> Tensor:
+        """What each command asks for, as it is now [m/s, m/s, rad/s, m, rad], shape (N, 5)."""
+        return measured_commands(self.state, self.robots)
+
+    # --- parts of a step ----------------------------------------------------------------------------------------------
+
+    def _aim(self, actions: Tensor) -> tuple[Tensor, Tensor | None]:
+        """PD targets, see :meth:`_act`, and the harness' wrench on the bases, (N, 6), or None without a harness."""
+        self._last_joint_vel, self._last_contact = self.state.joint_vel, self.state.foot_contact
+        targets = self._act(actions)
+        return targets, None if self._harness is None else harness_wrench(self.state, self.robots, self._harness)
+
+    def _act(self, actions: Tensor) -> Tensor:
+        """Remember the actions and turn them into canonical PD targets [rad], (N, 32); NaN where one is absurd."""
+        clip, live = self.task.control.action_clip, self._live
+        sound = actions.abs() <= MAX_ACTION
+        self._last_last_actions, self._last_actions = self._last_actions, self._actions
+        self._actions = torch.where(live & sound, actions.to(self._actions.dtype).clamp(-clip, clip), 0.0)
+        targets = self.posture.advance(self.command) + self.robots.action_scale * self._actions
+        absurd = (live & ~sound).any(dim=1, keepdim=True)
+        return (targets + self.randomizer.motor_offset).masked_fill(absurd, torch.nan)
+
+    def _judge(self) -> Judgement:
+        """Derive the new state, see what came of the step and what is sensed of it."""
+        self.episode_length_buf = self.episode_length_buf + 1
+        self.phase = advance_phase(self.phase, self.step_dt, self.robots.gait_frequency)
+        state, task, robots, causes = self.state, self.task, self.robots, self._causes
+        sick = causes > 0
+        reasons = terminations(state, task.terminations)
+        fallen = torch.stack(list(reasons.values())).any(dim=0) & ~sick
+        over = (self.episode_length_buf >= self.max_episode_length) | self.ground.left(state.root_pos_w)
+        time_outs = over & ~(fallen | sick)
+        dones = fallen | sick | time_outs
+        context = RewardContext(cfg=task.rewards, gait=task.gait, gait_shaping=self._gait_shaping, terminated=fallen)
+        rewards, terms = compute_rewards(state, robots, context, self._reward_factors)
+        scores = torch.stack(success_scores(state, robots, context), dim=1)
+        self.ground.judge(scores[:, 0], state)
+        errors, match = self.tracking_errors(), contact_match(state, task.gait)
+        log_rows = self.step_log.rows(terms, reasons, causes, errors, match, dones & ~time_outs, dones, state.standing)
+        self._observe()
+        rewards = rewards.masked_fill(sick, 0.0).float()
+        return Judgement(rewards, dones, time_outs, fallen, scores, log_rows, *self._derive_groups())
+
+    def _derive_groups(self) -> DerivedGroups:
+        """The observation groups that are worked out from the present state."""
+        cfg, state, friction = self.task.observations, self.state, self.task.randomization.friction
+        return DerivedGroups(
+            command_observation(state, cfg).float(),
+            clock_observation(state, cfg).float(),
+            critic_observation(self._last_frame, state, self.robots, self.embodiment, cfg, friction).float(),
+            estimation_target(state, self.embodiment, cfg).float(),
+        )
+
+    def _sense(self) -> tuple[Tensor]:
+        """The clean frame of the present state, (N, F)."""
+        return (proprioception(self.state, self.robots, self.task.observations),)
+
+    def _observe(self) -> None:
+        """Push the frame of the present state, delayed and corrupted, into the history."""
+        (frame,) = self._sense()
+        sensed = delay(frame, self._last_frame, self.randomizer.latency)
+        if self.task.observations.enable_corruption:
+            u = self.rng.uniform_in(-1.0, 1.0, self._noise_keys, self._step_count, SENSED_SIZE)
+            sensed[:, :SENSED_SIZE].addcmul_(u.to(frame.dtype), self._noise[:, :SENSED_SIZE])
+        self._last_frame = frame
+        self.history.push(sensed)
+
+    def _derive(self) -> PooledState:
+        """Turn the staging rows into the pooled state, with the command, phase and actions now in force."""
+        physical, standing = measured(self._staged, self.pool.columns), self.commands.standing
+        return PooledState(
+            **physical,
+            **self.ground.measure(physical["root_pos_w"], physical["root_quat_w"], physical["foot_pos_w"]),
+            joint_acc=(physical["joint_vel"] - self._last_joint_vel) / self.step_dt,
+            last_foot_contact=self._last_contact,
+            friction=self.randomizer.friction,
+            command=self.command,
+            standing=standing,
+            foot_phase=foot_phases(self.phase, standing, self.task.gait),
+            actions=self._actions,
+            last_actions=self._last_actions,
+            last_last_actions=self._last_last_actions,
+        )
+
+    def _forget(self) -> None:
+        """What was worked out of the state no longer holds."""
+        self._state, self._groups = None, None
+
+
+_STATE = (
+    *("_staged", "_last_joint_vel", "_last_contact", "_actions", "_last_actions", "_last_last_actions", "phase"),
+    *("commands.command", "randomizer.friction", "robots"),
+)
+"""What ``HumanoidEnv.state`` is made of."""
+_ACTIONS = ("_actions", "_last_actions", "_last_last_actions")
+_PARTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "_aim": (
+        (*_STATE, "randomizer.motor_offset", "_live", "_harness"),
+        (*_ACTIONS, "_last_joint_vel", "_last_contact"),
+    ),
+    "_judge": (
+        (
+            *_STATE,
+            *("_causes", "episode_length_buf", "_last_frame", "history.frames", "randomizer.latency", "embodiment"),
+            *("_step_count", "_noise", "_noise_keys", "_gait_shaping", "_reward_factors"),
+        ),
+        ("episode_length_buf", "phase", "_last_frame", "history.frames"),
+    ),
+    "_derive_groups": ((*_STATE, "_last_frame", "embodiment"), ()),
+    "_sense": (_STATE, ()),
+}
+"""Parts of ``HumanoidEnv.step``: attributes that each reads and writes."""
+
+
+def compile_step(env: ControlStep) -> None:
+    """Let an environment take its steps by compiled kernels.
+
+    Takes half a minute, or a few seconds where TorchInductor has compiled the same for as many environments before.
+
+    Raises:
+        CompileError: there is no C++ compiler, or it failed; the environment is as it was.
+    """
+    more = {"_aim": env.posture.ATTRIBUTES, "_judge": env.ground.ATTRIBUTES}
+    recordings: dict[str, Recording] = {}
+    for name, (reads, writes) in _PARTS.items():
+        read, written = more.get(name, ((), ()))
+        method = getattr(env, name)
+        recordings[name] = Recording(env, method, (*reads, *read), (*writes, *written), ("_state",))
+        recordings[name].make(*([torch.zeros_like(env._actions, dtype=torch.float32)] if name == "_aim" else []))
+    vars(env).update(recordings)

@@ -1,0 +1,217 @@
+"""Methods of tensor arithmetic, recorded once and replayed as one compiled kernel.
+
+A control step calls some 400 small torch operations, and on a CPU their calls cost more than their arithmetic. The code
+stays as it is: a method is run once on tensors that take notes, TorchInductor compiles the notes into C++, and from
+then on the kernel does what the method did. Nothing is traced by reading Python, so that nothing the method does but
+tensor arithmetic may matter: it must not branch on values, count in Python, or draw constants for the first time.
+"""
+
+from __future__ import annotations
+
+import shutil
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import fields, is_dataclass
+from operator import attrgetter
+from typing import Any, ClassVar, NamedTuple
+
+import torch
+from torch import Tensor, fx
+
+from eagle_rl.errors import CompileError
+
+COMPILERS = ("g++", "clang++")
+"""Any of which will do."""
+Attributes = tuple[tuple[str, ...], tuple[str, ...]]
+"""Paths of what a method reads and of what it writes."""
+
+
+class Attribute(NamedTuple):
+    """An attribute that holds a tensor, or a dataclass of tensors."""
+
+    path: str
+    """From the owner, e.g. ``commands.command``."""
+    kind: type | None
+    """The dataclass; None for a tensor."""
+
+    @classmethod
+    def of(cls, owner: object, path: str) -> Attribute:
+        """The attribute as it is now."""
+        value = attrgetter(path)(owner)
+        return cls(path, type(value) if is_dataclass(value) else None)
+
+    def paths(self) -> list[str]:
+        """Of its tensors."""
+        return [self.path] if self.kind is None else [f"{self.path}.{f.name}" for f in fields(self.kind)]
+
+    def put(self, owner: object, tensors: Iterator[Tensor | None]) -> None:
+        """Set it to the next of these tensors, as many as it takes."""
+        value = next(tensors) if self.kind is None else self.kind(**{f.name: next(tensors) for f in fields(self.kind)})
+        *way, name = self.path.split(".")
+        setattr(attrgetter(".".join(way))(owner) if way else owner, name, value)
+
+
+class Recording:
+    """Stands in for a method of an object, see the module.
+
+    Inputs are the method's arguments and the attributes it reads; results are what it returns, a tuple, and the
+    attributes it writes. Every result is a tensor of its own. Attributes that are None are left out, and there is one
+    kernel for each set of those that are not.
+    """
+
+    def __init__(
+        self,
+        owner: object,
+        method: Callable[..., Any],
+        reads: Sequence[str],
+        writes: Sequence[str] = (),
+        scratch: Sequence[str] = (),
+    ) -> None:
+        """Compile at the first call.
+
+        Args:
+            owner: object whose attributes are read and written, by their paths.
+            method: bound method of it.
+            reads: every attribute that the method reads and that may change, or is as large as the pool.
+            writes: every attribute that the method sets.
+            scratch: attributes, None before each call, that the method sets for itself.
+        """
+        self._owner, self._method = owner, method
+        self._reads, self._writes, self._scratch = tuple(reads), tuple(writes), tuple(scratch)
+        self._look = _getter(self._reads)
+        self._replays: dict[tuple[bool, ...], _Replay] = {}
+
+    def __call__(self, *args: Tensor) -> Any:
+        """Do what the method does."""
+        if _Replay.in_the_making:
+            return self._method(*args)
+        return self.make(*args)(*args)
+
+    def make(self, *args: Tensor) -> _Replay:
+        """The kernel for arguments like these and the attributes as they are, compiled if it is not there.
+
+        Raises:
+            CompileError: there is no C++ compiler, or it failed.
+        """
+        present = tuple(value is not None for value in self._look(self._owner))
+        replay = self._replays.get(present)
+        if replay is None:
+            reads = [path for path, there in zip(self._reads, present, strict=True) if there]
+            replay = self._replays[present] = _Replay(
+                self._owner, self._method, args, reads, self._writes, self._scratch
+            )
+        return replay
+
+    @property
+    def graphs(self) -> list[fx.GraphModule]:
+        """What was recorded, for tests."""
+        return [replay.graph for replay in self._replays.values()]
+
+
+class _Replay:
+    """A kernel and the way tensors get into it and out."""
+
+    in_the_making: ClassVar[bool] = False
+    """While one is made, methods that its own calls are to be run as they are."""
+
+    def __init__(
+        self,
+        owner: Any,
+        method: Callable[..., Any],
+        args: Sequence[Tensor],
+        reads: Sequence[str],
+        writes: Sequence[str],
+        scratch: Sequence[str],
+    ) -> None:
+        self._owner, self._scratch = owner, [Attribute(path, None) for path in scratch]
+        self._reads = [Attribute.of(owner, path) for path in reads]
+        self._writes = [Attribute.of(owner, path) for path in writes]
+        self._collect = _getter([path for attribute in self._reads for path in attribute.paths()])
+        self._returned: tuple[type, tuple[bool, ...]] = (tuple, ())
+        inputs = [x.detach().clone(memory_format=torch.contiguous_format) for x in (*args, *self._collect(owner))]
+        self._kinds = [(x.dtype, x.stride()) for x in inputs]
+        with torch.inference_mode(False), torch.no_grad():
+            self._run(method, len(args), [x.clone() for x in inputs])  # makes the constants the method keeps
+            self.graph = _record(lambda *tensors: self._run(method, len(args), tensors), inputs)
+            self._kernel = _compiled(self.graph, inputs)
+
+    def __call__(self, *args: Tensor) -> Any:
+        tensors = (*args, *self._collect(self._owner))
+        inputs = [
+            x if x.dtype == dtype and x.stride() == stride else x.to(dtype).contiguous()
+            for x, (dtype, stride) in zip(tensors, self._kinds, strict=True)
+        ]
+        results = iter(self._kernel(*inputs))
+        for attribute in self._writes:
+            attribute.put(self._owner, results)
+        kind, present = self._returned
+        values = [next(results) if there else None for there in present]
+        return tuple(values) if kind is tuple else kind(*values)
+
+    def _run(self, method: Callable[..., Any], num_args: int, tensors: Sequence[Tensor]) -> list[Tensor]:
+        """What the method writes and returns, given its inputs; leaves the owner as it was."""
+        with self._kept():
+            given = iter(tensors[num_args:])
+            for attribute in self._reads:
+                attribute.put(self._owner, given)
+            for attribute in self._scratch:
+                attribute.put(self._owner, iter((None,)))
+            returned = method(*tensors[:num_args])
+            self._returned = type(returned), tuple(value is not None for value in returned)
+            written = [attrgetter(path)(self._owner) for attribute in self._writes for path in attribute.paths()]
+        results = [*written, *(value for value in returned if value is not None)]
+        return [x.clone(memory_format=torch.contiguous_format) for x in results]
+
+    @contextmanager
+    def _kept(self) -> Iterator[None]:
+        """Put back, in the end, whatever is set in between."""
+        attributes = list(
+            {attribute.path: attribute for attribute in (*self._writes, *self._reads, *self._scratch)}.values()
+        )
+        before = [attrgetter(attribute.path)(self._owner) for attribute in attributes]
+        _Replay.in_the_making = True
+        try:
+            yield
+        finally:
+            _Replay.in_the_making = False
+            for attribute, value in zip(attributes, before, strict=True):
+                Attribute(attribute.path, None).put(self._owner, iter([value]))
+
+
+def _getter(paths: Sequence[str]) -> Callable[[object], tuple[Any, ...]]:
+    """Looks up all these attributes in one call, which for many is far quicker than one by one."""
+    get = attrgetter(*paths)
+    return get if len(paths) > 1 else lambda owner: (get(owner),)
+
+
+def _record(function: Callable[..., list[Tensor]], inputs: Sequence[Tensor]) -> fx.GraphModule:
+    """The operations of a function on these tensors; what is neither among them nor made of them is a constant."""
+    from torch.fx.experimental.proxy_tensor import make_fx
+
+    graph: fx.GraphModule = make_fx(function)(*inputs)
+    return graph
+
+
+def _compiled(graph: fx.GraphModule, inputs: list[Tensor]) -> Callable[..., Sequence[Tensor]]:
+    """The graph as one C++ kernel, for inputs of just these shapes and strides.
+
+    Inductor keeps what it compiled on disk, where only a graph of fake tensors is looked up.
+    """
+    if not any(shutil.which(name) for name in COMPILERS):
+        raise CompileError(f"There is no C++ compiler: none of {', '.join(COMPILERS)}. On Debian: apt install g++.")
+    from torch._guards import TracingContext, tracing
+    from torch._subclasses import FakeTensorMode
+    from torch.fx.experimental.symbolic_shapes import ShapeEnv
+
+    mode = FakeTensorMode(shape_env=ShapeEnv())
+    fakes: list[Any] = [mode.from_tensor(x, static_shapes=True) for x in inputs]
+    try:
+        with tracing(TracingContext(mode)), warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # torch warns of torch
+            from torch._inductor import compile as compile_graph
+
+            kernel: Callable[..., Sequence[Tensor]] = compile_graph(graph, fakes)
+    except Exception as error:  # whatever the compiler and those who drive it raise
+        raise CompileError(f"The step could not be compiled: {error}") from error
+    return kernel
