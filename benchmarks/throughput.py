@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import replace
+from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from statistics import median
 from typing import Any
@@ -13,6 +14,8 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from eagle_rl.algorithms.eagle_ppo import EaglePPO
+from eagle_rl.machine import own_cores
+from eagle_rl.models.shares import use_threads
 from eagle_rl.runners.on_policy import EagleRunner
 
 from .budget import Budget
@@ -83,33 +86,48 @@ class _Products(TorchDispatchMode):
 
 
 class _Multiplying:
-    """The matrix products of an update, and nothing else."""
+    """The matrix products of an update, and nothing else, by as many threads as the learner has."""
 
-    def __init__(self, products: Counter[Product]) -> None:
+    def __init__(self, products: Counter[Product], threads: int) -> None:
         self._work = [
             (torch.randn(m, k).to(dtype), torch.randn(k, n).to(dtype), count)
-            for (m, k, n, dtype), count in products.items()
+            for (m, k, n, dtype), count in (_part(product, threads) for product in products.items())
         ]
+        self._pool = ThreadPoolExecutor(threads, initializer=torch.get_num_threads)
+        self._threads = threads
         self.flops = sum(2.0 * m * k * n * count for (m, k, n, _), count in products.items())
 
     def multiply(self) -> None:
+        list(self._pool.map(lambda _: self._multiply_part(), range(self._threads)))
+
+    def _multiply_part(self) -> None:
         for a, b, count in self._work:
             for _ in range(count):
                 torch.mm(a, b)
 
 
+def _part(product: tuple[Product, int], threads: int) -> tuple[Product, int]:
+    """A thread's part of a product that is computed so many times: its longest side is shared out."""
+    (*sides, dtype), count = product
+    longest = sides.index(max(sides))
+    m, k, n = (math.ceil(side / threads) if i == longest else side for i, side in enumerate(sides))
+    return (m, k, n, dtype), count
+
+
 def _products_of_update(runner: EagleRunner) -> _Multiplying:
-    """Train for an iteration and see what its update multiplies."""
+    """Train for an iteration and see what its update multiplies, which only its own thread can be asked for."""
     counted, update = _Products(), runner.alg.update
 
     def counting() -> dict[str, float]:
         with counted:
             return update()
 
+    use_threads(1)
     runner.alg.update = counting  # type: ignore[method-assign]
     runner.learn(1)
     del runner.alg.update
-    return _Multiplying(counted.counts)
+    use_threads(own_cores())
+    return _Multiplying(counted.counts, own_cores())
 
 
 def iteration(num_envs: int, threads: int, iterations: int) -> list[Figure]:
@@ -118,7 +136,7 @@ def iteration(num_envs: int, threads: int, iterations: int) -> list[Figure]:
     env = make_env(cfg, num_envs)
     runner, bare = make_runner(cfg, env), BarePhysics(env)
     products = _products_of_update(runner)
-    budget, wall, cpu = Budget(), [], []
+    budget, wall = Budget(), []
     for owner, method, section in ((EaglePPO, "update", "update"), (bare, "step", "bare")):
         budget.watch(owner, method, section, whole=True)
     budget.watch(products, "multiply", "products")
@@ -128,17 +146,11 @@ def iteration(num_envs: int, threads: int, iterations: int) -> list[Figure]:
             bare.step()
         products.multiply()
         wall.append(dict(budget.wall))
-        cpu.append(dict(budget.cpu))
 
     with budget:
         runner.learn(iterations + 1, on_iteration=turn)
     env_steps = cfg.algo.num_steps_per_env * num_envs
-    worked = _medians(cpu)
-    saved = worked["bare"] * (1.0 - 1.0 / threads)  # by threads that have a core each
-    ideal = worked | {"bare": worked["bare"] - saved, "other": worked["other"] - saved}
-    figures = _iteration_figures(num_envs, env_steps, ideal, products.flops)[:3]
-    figures = [replace(figure, name=f"{figure.name}, from CPU time") for figure in figures]
-    return _iteration_figures(num_envs, env_steps, _medians(wall), products.flops) + figures
+    return _iteration_figures(num_envs, env_steps, _medians(wall), products.flops)
 
 
 def _medians(books: list[dict[str, float]]) -> dict[str, float]:

@@ -10,6 +10,7 @@ import torch
 from eagle_rl.cli.environment import make_env_factory
 from eagle_rl.config.load import load_experiment
 from eagle_rl.config.schema import ExperimentCfg
+from eagle_rl.machine import own_cores
 from eagle_rl.models.precision import set_up_torch
 from eagle_rl.runners.on_policy import EagleRunner, make_train_cfg
 from envs.humanoid_env import HumanoidEnv
@@ -18,17 +19,21 @@ SEED = 1
 
 
 def experiment(threads: int) -> ExperimentCfg:
-    """The default experiment with a number of physics threads; torch gets one, see ``docs/performance.md``."""
+    """The default experiment with a number of physics threads; the learner has every core, as by default."""
     cfg = load_experiment("ppo")
-    set_up_torch(1)
+    set_up_torch(own_cores())
     return replace(cfg, run=replace(cfg.run, num_threads=threads))
 
 
-def make_env(cfg: ExperimentCfg, num_envs: int, robots: Sequence[str] | None = None) -> HumanoidEnv:
-    """An environment in the middle of training: everything randomized, episodes of all ages."""
+def make_env(
+    cfg: ExperimentCfg, num_envs: int, robots: Sequence[str] | None = None, compiled: bool = True
+) -> HumanoidEnv:
+    """An environment in the middle of training: everything randomized, episodes of all ages, steps compiled."""
     env: HumanoidEnv = make_env_factory(cfg.run)(robots or cfg.robots, num_envs, cfg.task, SEED)
     torch.manual_seed(SEED)
     env.episode_length_buf = torch.randint(0, env.max_episode_length, (num_envs,))
+    if compiled:
+        env.compile()
     return env
 
 

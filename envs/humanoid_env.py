@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -14,8 +15,9 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from eagle_rl.config.schema import TaskCfg
+from eagle_rl.errors import CompileError, EagleWarning
 
-from .control_step import ControlStep, compile_step
+from .control_step import ControlStep, Kernels
 from .ground import make_ground
 from .mdp.active_commands import ActiveCommands
 from .mdp.aids import LearningAids, harness_damping
@@ -141,6 +143,8 @@ class HumanoidEnv(ControlStep, VecEnv):
         self._last_contact = torch.zeros(n, 2, dtype=torch.bool, device=device)
         self._staged, self._causes = self.pool.staged(), self.pool.causes()
         self._reward_factors = self._weigh()
+        self._kernels: Kernels | None = None
+        self._kernels_from = 0
         self._forget()
         (self._last_frame,) = self._sense()
         self.history = History(n, self.task.observations.history_length, self._last_frame)
@@ -159,6 +163,11 @@ class HumanoidEnv(ControlStep, VecEnv):
             physics took [s] (``physics_time``), and ``final_observations`` of the environments ``final_ids``, whose
             returns are to end there and be bootstrapped: they timed out, or get a new command or a push next.
         """
+        if self._kernels is not None and self.common_step_counter >= self._kernels_from:
+            try:
+                self._adopt_kernels()
+            except CompileError as error:
+                warnings.warn(f"{error} Training goes on without, a little slower.", EagleWarning, stacklevel=2)
         self._physics_step(*self._aim(actions))
         self.common_step_counter += 1
         self._step_count.fill_(self.common_step_counter)
@@ -180,9 +189,21 @@ class HumanoidEnv(ControlStep, VecEnv):
         self._resample()
         return self.get_observations(), judged.rewards, dones, extras
 
-    def compile(self) -> None:
-        """From now on compute steps by compiled kernels, equal up to rounding; see :func:`compile_step`."""
-        compile_step(self)
+    def compile(self, from_step: int | None = None) -> None:
+        """Compute steps by compiled kernels, equal up to rounding, see :class:`Kernels`.
+
+        Args:
+            from_step: control step since creation from which on to use them, so that they are compiled in the
+                background meanwhile, and if they cannot be, that is a warning; None waits for them now.
+
+        Raises:
+            CompileError: there is no C++ compiler, or it failed.
+        """
+        self._kernels = Kernels(self)
+        if from_step is None:
+            self._adopt_kernels()
+        else:
+            self._kernels_from = from_step
 
     def reset(self) -> None:
         """Start new episodes everywhere; random streams go on."""
@@ -232,6 +253,12 @@ class HumanoidEnv(ControlStep, VecEnv):
         start = time.perf_counter()
         self._staged = self.pool.step(targets, wrench)
         self._physics_time = time.perf_counter() - start
+
+    def _adopt_kernels(self) -> None:
+        """Wait for the kernels and use them from now on."""
+        kernels, self._kernels = self._kernels, None
+        assert kernels is not None, "they are being compiled"
+        kernels.adopt(self)
 
     def _apply_aids(self) -> None:
         """Spread the aids' scales over the environments, and put the harness' share of the damping in force."""

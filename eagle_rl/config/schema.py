@@ -250,9 +250,10 @@ class RunCfg:
     they are hardly slower than one. Results depend in the last digits on their number, and so with 0 on the machine;
     never on what else runs."""
     compile: Literal["auto", "always", "never"] = "auto"
-    """Whether training takes the environments' steps by kernels compiled from their code, equal up to rounding, which
-    takes half a minute (a few seconds the next time). ``auto`` does in stages of two million steps and more, on a CPU
-    with a C++ compiler (docs/performance.md)."""
+    """Whether training takes the environments' steps by kernels compiled from their code, equal up to rounding.
+    ``auto`` does on a CPU, in stages of five million steps and more: it compiles in the background, half a minute of a
+    core, and uses the kernels from control step 1000 on. ``always`` waits for them before the first step
+    (docs/performance.md)."""
     save_interval: int = 50
     """Iterations between checkpoints."""
     keep_checkpoints: int = 3

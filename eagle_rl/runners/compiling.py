@@ -2,44 +2,30 @@
 
 from __future__ import annotations
 
-import warnings
 from typing import Any
 
-from rich.console import Console
-
 from eagle_rl.config.schema import RunCfg
-from eagle_rl.errors import CompileError, EagleWarning
 
-WORTH_IT = 2_000_000
+WORTH_IT = 5_000_000
 """Environment steps from which on compiling saves more time than it takes [-] (docs/performance.md)."""
+FROM_STEP = 1000
+"""Control step from which on a run that does not wait for its kernels uses them: after a minute or more."""
 
 
-def compile_where_it_pays(env: Any, run: RunCfg, env_steps: int, name: str) -> None:
+def compile_where_it_pays(env: Any, run: RunCfg, env_steps: int) -> None:
     """Compile an environment's steps as ``run.compile`` says, by ``env.compile()``.
 
-    Nothing that a clock says decides, so that a resumed run computes what the interrupted one would have.
+    No clock has a say in it, so that a resumed run computes what the interrupted one would have.
 
     Args:
         env: the environments of a stage.
         run: whether and where.
         env_steps: budget of the stage.
-        name: of the stage.
 
     Raises:
         CompileError: it must be compiled and cannot be.
     """
-    wanted = run.compile == "always"
-    pays = run.compile == "auto" and env_steps >= WORTH_IT and run.env_device == "cpu"
-    if not (wanted or pays):
-        return
-    Console(stderr=True).print(
-        f"{name}: compiling the environment's step; the first time on a machine it takes half a minute",
-        highlight=False,
-        soft_wrap=True,
-    )
-    try:
+    if run.compile == "always":
         env.compile()
-    except CompileError as error:
-        if wanted:
-            raise
-        warnings.warn(f"{error} Training goes on without, a little slower.", EagleWarning, stacklevel=2)
+    elif run.compile == "auto" and env_steps >= WORTH_IT and run.env_device == "cpu":
+        env.compile(from_step=FROM_STEP)

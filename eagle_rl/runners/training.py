@@ -145,7 +145,7 @@ def _make_runner(job: Job) -> EagleRunner:
     """The runner of a stage, its specialists loaded."""
     cfg, stage = job.cfg, job.stage
     env: VecEnv = job.make_env(stage.robots, cfg.num_envs, cfg.task, stage.seed + job.rank)
-    compile_where_it_pays(env, cfg.run, stage.env_steps, stage.name)
+    compile_where_it_pays(env, cfg.run, stage.env_steps)
     acting_base = _load(job.base, cfg.run.env_device)
     history = cfg.task.observations.history_length
     if stage.demonstrations:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, fx
 
 from eagle_rl.config.schema import AidsCfg, CommandsCfg, ControlCfg, ObservationsCfg, TaskCfg, TerrainCfg
-from eagle_rl.errors import CompileError
+from eagle_rl.errors import CompileError, EagleWarning
 from envs import recording
 from envs.humanoid_env import HumanoidEnv
 from envs.recording import Recording
@@ -95,7 +95,7 @@ def test_recording_leaves_the_owner_as_it_was_and_results_share_no_memory() -> N
     tally = Tally()
     before = tally.pair
     add = record(tally)
-    add.make(torch.ones(2, 3))
+    add.record(torch.ones(2, 3))
     assert tally.pair is before
     assert tally.count.tolist() == [0, 0]
     add(torch.ones(2, 3))
@@ -108,7 +108,7 @@ def test_recording_leaves_the_owner_as_it_was_and_results_share_no_memory() -> N
 def test_methods_that_a_recorded_method_calls_are_recorded_with_it() -> None:
     tally = Tally()
     total = Recording(tally, tally.total, ("pair",))
-    total.make()
+    total.record()
     tally.total = total  # type: ignore[method-assign]
     assert record(tally)(torch.ones(2, 3)).total.tolist() == [12.0, 30.0]
     assert record(tally)(torch.ones(2, 3)).total.tolist() == [18.0, 36.0]
@@ -131,7 +131,7 @@ def test_a_failing_compiler_is_reported(monkeypatch: pytest.MonkeyPatch) -> None
 
     monkeypatch.setattr(inductor, "compile", fail)
     with pytest.raises(CompileError, match="no space left"):
-        record(Tally()).make(torch.ones(2, 3))
+        record(Tally())(torch.ones(2, 3))
 
 
 def outcomes(env: HumanoidEnv, steps: int) -> Iterator[dict[str, Tensor]]:
@@ -195,6 +195,25 @@ def test_a_recorded_environment_resumes_to_the_bit() -> None:
         expected, result = env.step(actions(N, step)), other.step(actions(N, step))
         assert_same(expected[0], result[0], f"step {step}")
         assert torch.equal(expected[1], result[1])
+
+
+@pytest.mark.usefixtures("uncompiled")
+def test_kernels_made_in_the_background_are_used_from_the_step_on_that_was_said() -> None:
+    env = make_env(num_envs=N)
+    env.compile(from_step=3)
+    for step in range(5):
+        assert [part for part in PARTS if part in vars(env)] == ([] if step < 4 else list(PARTS)), step
+        env.step(actions(N, step))
+
+
+def test_a_failure_in_the_background_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recording.shutil, "which", lambda name: None)
+    env = make_env(num_envs=2)
+    env.compile(from_step=1)
+    env.step(actions(2, 0))
+    with pytest.warns(EagleWarning, match=r"no C\+\+ compiler.*goes on without"):
+        env.step(actions(2, 1))
+    env.step(actions(2, 2))
 
 
 def test_compiled_kernels_equal_the_code_up_to_rounding() -> None:
