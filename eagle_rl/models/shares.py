@@ -19,9 +19,8 @@ from torch.autograd.function import once_differentiable
 
 T = TypeVar("T")
 
-MIN_ROWS = 128
-"""Of a share. Weights are read, and their gradients written and summed, once for each, which takes as long as up to a
-hundred rows."""
+MIN_WORK = 2**25
+"""Multiplications of a share, rows by parameters. To share out and gather takes .6 ms, in which a core does so many."""
 
 
 class _Threads:
@@ -82,10 +81,11 @@ class SharedMLP(MLP):
     def __init__(self, network: MLP) -> None:
         """Take over the layers of ``network``."""
         nn.Sequential.__init__(self, *network)  # MLP's own makes new ones
+        self._least_rows = _least_rows(network)
 
     def forward(self, x: Tensor) -> Tensor:
         """Outputs (N, ...) of rows (N, C)."""
-        blocks = _blocks(x)
+        blocks = _blocks(x, self._least_rows)
         if len(blocks) == 1:
             return super().forward(x)
         parameters = tuple(self.parameters())
@@ -130,14 +130,19 @@ class _Shares(torch.autograd.Function):
         return None, None, x_grad, *(next(sums) if wanted else None for wanted in of_parameters)
 
 
-def _blocks(x: Tensor) -> tuple[Tensor, ...]:
+def _least_rows(network: nn.Module) -> int:
+    """Rows of a share that are worth a thread's while."""
+    return max(1, MIN_WORK // sum(parameter.numel() for parameter in network.parameters()))
+
+
+def _blocks(x: Tensor, least_rows: int) -> tuple[Tensor, ...]:
     """Contiguous rows of ``x`` (N, C) for each thread that gets enough of them; all of ``x`` where there is no other.
 
     A network that is exported is whole: its graph is to hold for any number of rows.
     """
     if _threads.count == 1 or x.ndim != 2 or x.device.type != "cpu" or torch.compiler.is_compiling():
         return (x,)
-    return x.tensor_split(max(1, min(_threads.count, len(x) // MIN_ROWS)))
+    return x.tensor_split(max(1, min(_threads.count, len(x) // least_rows)))
 
 
 def _in_any_thread(do: Callable[[Any], T], with_graph: bool = False) -> Callable[[Any], T]:

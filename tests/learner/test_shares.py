@@ -17,13 +17,25 @@ from torch import Tensor, nn
 
 from eagle_rl.models import shares
 from eagle_rl.models.precision import keep_outputs_exact, set_up_torch
-from eagle_rl.models.shares import MIN_ROWS, SharedMLP, use_threads
+from eagle_rl.models.shares import MIN_WORK, SharedMLP, use_threads
 from tests.learner.helpers import collect, make_runner, parameters
 from tests.toy import ToyEnv
 
 INPUTS, OUTPUTS = 7, 3
+MIN_ROWS = 64
+"""Of a share, in these tests: small networks would need thousands to be worth it."""
 ENOUGH = 2 * MIN_ROWS + 1
 """Rows that two threads share, one of them with one more."""
+
+
+REALLY_LEAST = shares._least_rows
+
+
+@pytest.fixture(autouse=True, scope="module")
+def small_shares():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(shares, "_least_rows", lambda network: MIN_ROWS)
+        yield
 
 
 def plain(seed: int = 0) -> MLP:
@@ -70,6 +82,16 @@ def blocks_of(network: MLP, x: Tensor) -> list[int]:
     network(x)
     handle.remove()
     return sorted(sizes, reverse=True)
+
+
+def test_a_share_is_worth_the_hand_over(monkeypatch):
+    monkeypatch.setattr(shares, "_least_rows", REALLY_LEAST)
+    small, large = SharedMLP(plain()), SharedMLP(MLP(512, 32, (256, 128), "elu"))
+    assert small._least_rows * sum(p.numel() for p in small.parameters()) == pytest.approx(MIN_WORK, rel=1e-3)
+    use_threads(2)
+    few, many = torch.zeros(384, 512), torch.zeros(1536, 512)
+    assert blocks_of(large, few) == [384], "two thirds of a millisecond were lost to save one"
+    assert blocks_of(large, many) == [768, 768]
 
 
 @settings(max_examples=40)
