@@ -31,19 +31,27 @@ class Cost:
     """Of all threads of the process; what the kernel has booked, so it wants many rounds where threads are short."""
 
 
-def in_turns(actions: Mapping[str, Callable[[], object]], seconds: float, warm_up: int = 3) -> dict[str, Cost]:
+def in_turns(
+    actions: Mapping[str, Callable[[], object]],
+    seconds: float,
+    warm_up: int = 3,
+    before: Mapping[str, Callable[[], object]] | None = None,
+) -> dict[str, Cost]:
     """Do every action in turn until the time is up; their median costs.
 
     Args:
         actions: what to measure, by name.
         seconds: how long to go on [s]; at least five rounds are made.
         warm_up: rounds that are not counted.
+        before: what is done before an action and not measured, by the action's name.
     """
     walls: dict[str, list[float]] = {name: [] for name in actions}
     cpus: dict[str, list[float]] = {name: [] for name in actions}
     end, rounds = time.perf_counter() + seconds, 0
     while rounds < warm_up + 5 or time.perf_counter() < end:
         for name, action in actions.items():
+            if before is not None and name in before:
+                before[name]()
             wall, cpu = time.perf_counter(), time.process_time()
             action()
             walls[name].append(time.perf_counter() - wall)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from statistics import median
@@ -19,14 +18,14 @@ from eagle_rl.models.shares import use_threads
 from eagle_rl.runners.on_policy import EagleRunner
 
 from .budget import Budget
-from .measure import Figure, in_turns, milliseconds
+from .measure import Cost, Figure, in_turns, milliseconds
 from .workloads import BarePhysics, Stepping, experiment, make_env, make_runner
 
 
 def environment(num_envs: int, threads: int, seconds: float, bar: str) -> list[Figure]:
     """Rate of the whole environment step as a share of the bare physics' rate, as measured and as the CPU time says."""
     env = make_env(experiment(threads), num_envs)
-    costs = in_turns({"step": Stepping(env).step, "bare": BarePhysics(env).step}, seconds)
+    costs = BarePhysics(env).in_turns_with(Stepping(env).step, seconds)
     step, bare = costs["step"], costs["bare"]
     name = f"environment step / bare physics, {num_envs} envs"
     detail = milliseconds(step=step.wall, bare=bare.wall)
@@ -42,18 +41,16 @@ def environment(num_envs: int, threads: int, seconds: float, bar: str) -> list[F
 def pooling(num_envs: int, threads: int, seconds: float) -> list[Figure]:
     """Five robots pooled against one robot at a time with as many environments, each weighted by its physics."""
     cfg = experiment(threads)
-    actions: dict[str, Callable[[], object]] = {}
+    costs: dict[str, dict[str, Cost]] = {}
     for name in (*cfg.robots, "pool"):
         env = make_env(cfg, num_envs, None if name == "pool" else (name,))
-        actions[name] = Stepping(env).step
-        actions[f"{name} bare"] = BarePhysics(env).step
-    costs = in_turns(actions, seconds, warm_up=2)
+        costs[name] = BarePhysics(env).in_turns_with(Stepping(env).step, seconds / 6)
 
     def overhead(name: str) -> float:
-        return costs[name].cpu - costs[f"{name} bare"].cpu
+        return costs[name]["step"].cpu - costs[name]["bare"].cpu
 
     alone = sum(overhead(name) for name in cfg.robots) / len(cfg.robots)
-    physics = costs["pool bare"].cpu / threads
+    physics = costs["pool"]["bare"].cpu / threads
     ratio = (physics + alone) / (physics + overhead("pool"))
     detail = milliseconds(pool_overhead=overhead("pool"), mean_overhead_alone=alone, physics=physics)
     return [Figure("five robots pooled / one robot, same physics", ratio, "x", ">= 0.95", detail)]
@@ -137,13 +134,31 @@ def iteration(num_envs: int, threads: int, iterations: int) -> list[Figure]:
     runner, bare = make_runner(cfg, env), BarePhysics(env)
     products = _products_of_update(runner)
     budget, wall = Budget(), []
-    for owner, method, section in ((EaglePPO, "update", "update"), (bare, "step", "bare")):
+    for owner, method, section in (
+        (EaglePPO, "update", "update"),
+        (bare, "step", "bare"),
+        (bare, "remember", "bookkeeping"),
+        (bare, "remember_targets", "bookkeeping"),
+        (bare, "rewind", "bookkeeping"),
+        (bare, "return_to_present", "bookkeeping"),
+        (products, "multiply", "products"),
+    ):
         budget.watch(owner, method, section, whole=True)
-    budget.watch(products, "multiply", "products")
+    step = env.step
+
+    def remembered(actions: torch.Tensor) -> Any:
+        bare.remember()
+        outcome = step(actions)
+        bare.remember_targets()
+        return outcome
+
+    env.step = remembered  # type: ignore[method-assign]
 
     def turn(_: int) -> None:
         for _ in range(cfg.algo.num_steps_per_env):
+            bare.rewind()
             bare.step()
+        bare.return_to_present()
         products.multiply()
         wall.append(dict(budget.wall))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
@@ -14,6 +14,9 @@ from eagle_rl.machine import own_cores
 from eagle_rl.models.precision import set_up_torch
 from eagle_rl.runners.on_policy import EagleRunner, make_train_cfg
 from envs.humanoid_env import HumanoidEnv
+from envs.robots.spec import Array
+
+from .measure import Cost, in_turns
 
 SEED = 1
 
@@ -56,18 +59,57 @@ class Stepping:
 class BarePhysics:
     """The physics of an environment without anything around it: native threads over the same simulations.
 
-    It goes on from the present states under the present targets, as the environment then does in its turn. MuJoCo's
-    batch is as fast as a loop of ``mj_step`` in C (``docs/performance.md``).
+    It takes the control steps that the environment took once more, from the same states under the same targets; under
+    targets that stay as they are robots come to rest, and physics is up to a tenth quicker. MuJoCo's batch is as fast
+    as a loop of ``mj_step`` in C (``docs/performance.md``).
     """
 
     def __init__(self, env: HumanoidEnv) -> None:
         """Take the simulations of ``env``."""
         self._batches = env.pool.batches
+        self._starts: list[list[tuple[Array, Array]]] = []
+        self._present: list[Array] | None = None
+
+    def remember(self) -> None:
+        """Keep the states from which the environment takes its next step."""
+        self._starts.append([(batch.state(), batch.ctrl) for batch in self._batches])
+
+    def remember_targets(self) -> None:
+        """Keep the targets under which it took that step."""
+        self._starts[-1] = [(state, targets.copy()) for state, targets in self._starts[-1]]
+
+    def rewind(self) -> None:
+        """Go back to where the first of the remembered steps began, and forget it."""
+        if self._present is None:
+            self._present = [batch.state() for batch in self._batches]
+        for batch, (state, targets) in zip(self._batches, self._starts.pop(0), strict=True):
+            batch.overwrite(state)
+            batch.ctrl[:] = targets
 
     def step(self) -> None:
         """As many physics steps as one control step has."""
         for batch in self._batches:
             batch.advance()
+
+    def return_to_present(self) -> None:
+        """Undo what was rewound."""
+        if self._present is not None:
+            for batch, state in zip(self._batches, self._present, strict=True):
+                batch.overwrite(state)
+            self._present = None
+
+    def in_turns_with(self, step: Callable[[], object], seconds: float, warm_up: int = 3) -> dict[str, Cost]:
+        """Costs of the environment's ``step`` and of its ``bare`` physics."""
+
+        def begin() -> None:
+            self.return_to_present()
+            self.remember()
+
+        def again() -> None:
+            self.remember_targets()
+            self.rewind()
+
+        return in_turns({"step": step, "bare": self.step}, seconds, warm_up, {"step": begin, "bare": again})
 
 
 def make_runner(cfg: ExperimentCfg, env: HumanoidEnv) -> EagleRunner:

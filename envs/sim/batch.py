@@ -177,9 +177,13 @@ class RobotBatch:
         """A copy of every simulation's integration state, shape (n, nstate)."""
         return self._batch.state.copy()
 
+    def overwrite(self, state: Array) -> None:
+        """Restore what :meth:`state` returned; derived quantities are old ones until the next step."""
+        self._batch.state[:] = state
+
     def set_state(self, state: Array) -> None:
         """Restore what :meth:`state` returned and recompute the derived quantities."""
-        self._batch.state[:] = state
+        self.overwrite(state)
         self._last_time[:] = self._time
         self._recorder.forget(slice(None))
         self.refresh(np.arange(self.num_envs))

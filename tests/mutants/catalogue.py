@@ -43,6 +43,8 @@ LOSSES = "eagle_rl/algorithms/losses.py"
 GAUSSIAN = "eagle_rl/models/distribution.py"
 PPO = "eagle_rl/algorithms/eagle_ppo.py"
 ENV = "envs/humanoid_env.py"
+CONTROL_STEP = "envs/control_step.py"
+RECORDING = "envs/recording.py"
 AUXILIARY = "eagle_rl/algorithms/auxiliary.py"
 ACTOR = "eagle_rl/models/actor.py"
 SHARES = "eagle_rl/models/shares.py"
@@ -282,5 +284,13 @@ MUTANTS: tuple[Mutant, ...] = (
     ),
     Mutant(
         SHARES, 'torch.autocast("cpu", dtype, mixed,', 'torch.autocast("cpu", dtype, False,', "learner/test_shares.py"
+    ),
+    Mutant(CONTROL_STEP, '"_noise_keys", ', "", "envs/test_recording.py"),
+    Mutant(CONTROL_STEP, 'writes, *written), ("_state",)', "writes, *written), ()", "envs/test_recording.py"),
+    Mutant(
+        RECORDING,
+        "x.clone(memory_format=torch.contiguous_format) for x in results",
+        "x for x in results",
+        "envs/test_recording.py",
     ),
 )
