@@ -8,7 +8,9 @@ tensor arithmetic may matter: it must not branch on values, count in Python, or 
 
 from __future__ import annotations
 
+import os
 import shutil
+import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -21,8 +23,6 @@ from torch import Tensor, fx
 
 from eagle_rl.errors import CompileError
 
-COMPILERS = ("g++", "clang++")
-"""Any of which will do."""
 Attributes = tuple[tuple[str, ...], tuple[str, ...]]
 """Paths of what a method reads and of what it writes."""
 
@@ -192,6 +192,18 @@ class _Replay:
                 Attribute(attribute.path, None).put(self._owner, iter([value]))
 
 
+def find_compiler() -> str:
+    """The C++ compiler that TorchInductor will take.
+
+    Raises:
+        CompileError: it is not there.
+    """
+    name = os.getenv("CXX", "clang++" if sys.platform == "darwin" else "g++")
+    if shutil.which(name) is None:
+        raise CompileError(f"There is no C++ compiler {name!r}. On Debian: apt install g++; or name another in CXX.")
+    return name
+
+
 def _getter(paths: Sequence[str]) -> Callable[[object], tuple[Any, ...]]:
     """Looks up all these attributes in one call, which for many is far quicker than one by one."""
     get = attrgetter(*paths)
@@ -211,8 +223,7 @@ def _compiled(graph: fx.GraphModule, inputs: list[Tensor]) -> Callable[..., Sequ
 
     Inductor keeps what it compiled on disk, where only a graph of fake tensors is looked up.
     """
-    if not any(shutil.which(name) for name in COMPILERS):
-        raise CompileError(f"There is no C++ compiler: none of {', '.join(COMPILERS)}. On Debian: apt install g++.")
+    find_compiler()
     from torch._guards import TracingContext, tracing
     from torch._subclasses import FakeTensorMode
     from torch.fx.experimental.symbolic_shapes import ShapeEnv

@@ -17,7 +17,7 @@ from packaging.requirements import Requirement
 
 from eagle_rl.config.compose import known_names
 from eagle_rl.config.load import load_experiment
-from eagle_rl.errors import EagleError
+from eagle_rl.errors import CompileError, EagleError
 from eagle_rl.machine import usable_cores
 from eagle_rl.paths import data_root
 
@@ -95,6 +95,16 @@ def _fault(load: Callable[[str], object], name: str) -> str:
     return ""
 
 
+def check_compiler() -> list[Finding]:
+    """Whether steps can be compiled; long training is a little quicker with."""
+    from envs.recording import find_compiler
+
+    try:
+        return [Finding("compiler", "ok", find_compiler())]
+    except CompileError as error:
+        return [Finding("compiler", "warn", f"{error} Training goes on without, a little slower.")]
+
+
 def check_graphics() -> list[Finding]:
     """Whether pictures can be rendered without a display; tried in another process, for a bad driver may kill it."""
     backend = os.environ.get("MUJOCO_GL", "egl")
@@ -123,7 +133,7 @@ def main(argv: Sequence[str]) -> int:
     """Run ``eagle doctor``; 2 if something is missing without which nothing works."""
     argparse.ArgumentParser(prog="eagle doctor", description=__doc__).parse_args(argv)
     findings: list[Finding] = []
-    for check in (check_machine, check_packages, check_data, check_graphics, check_folder):
+    for check in (check_machine, check_packages, check_data, check_compiler, check_graphics, check_folder):
         findings += check()
     for finding in findings:
         print(f"{finding.state:<4}  {finding.name:<16} {finding.detail}")

@@ -65,6 +65,14 @@ def test_doctor_finds_data_and_folder_in_order():
     assert {finding.state for finding in (*doctor.check_data(), *doctor.check_folder())} == {"ok"}
 
 
+def test_doctor_says_what_is_lost_without_a_compiler(monkeypatch):
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    (finding,) = doctor.check_compiler()
+    assert finding.state == "warn"
+    assert "'no-such-compiler'" in finding.detail
+    assert "a little slower" in finding.detail
+
+
 def test_doctor_names_a_package_that_is_too_old(monkeypatch):
     monkeypatch.setattr(
         doctor, "requires", lambda name: ["numpy>=999", "no-such-package", "hypothetical; extra == 'dev'"]
