@@ -117,7 +117,7 @@ def test_methods_that_a_recorded_method_calls_are_recorded_with_it() -> None:
 def test_without_a_compiler_the_message_says_how_to_get_one(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CXX", "no-such-compiler")
     env = make_env(num_envs=2)
-    with pytest.raises(CompileError, match="'no-such-compiler'.*apt install"):
+    with pytest.raises(CompileError, match=r"'no-such-compiler'.*apt install"):
         env.compile()
     assert not any(part in vars(env) for part in PARTS), "the environment is half compiled"
     env.step(actions(2, 0))
