@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import threading
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from eagle_rl.config.schema import TaskCfg
-from eagle_rl.errors import CompileError
 
 from .ground import Plane
 from .mdp.active_commands import ActiveCommands
@@ -245,39 +243,19 @@ _PARTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 """Parts of ``HumanoidEnv.step``: attributes that each reads and writes."""
 
 
-class Kernels:
-    """Kernels for the parts of a step, compiled by a thread of their own.
+def compile_step(env: ControlStep) -> None:
+    """Let an environment take its steps by compiled kernels.
 
     It takes half a minute, or a few seconds where TorchInductor has compiled the same for as many environments before.
+
+    Raises:
+        CompileError: there is no C++ compiler, or it failed; the environment is as it was.
     """
-
-    def __init__(self, env: ControlStep) -> None:
-        """Record every part and begin to compile."""
-        more = {"_aim": env.posture.ATTRIBUTES, "_judge": env.ground.ATTRIBUTES}
-        self._recordings: dict[str, Recording] = {}
-        for name, (reads, writes) in _PARTS.items():
-            read, written = more.get(name, ((), ()))
-            recording = Recording(env, getattr(env, name), (*reads, *read), (*writes, *written), ("_state",))
-            recording.record(*([torch.zeros_like(env._actions, dtype=torch.float32)] if name == "_aim" else []))
-            self._recordings[name] = recording
-        self._error: CompileError | None = None
-        self._thread = threading.Thread(target=self._compile, name="compiler", daemon=True)
-        self._thread.start()
-
-    def adopt(self, env: ControlStep) -> None:
-        """Wait for the kernels, and put them in the place of the parts.
-
-        Raises:
-            CompileError: there is no C++ compiler, or it failed; the environment is as it was.
-        """
-        self._thread.join()
-        if self._error is not None:
-            raise self._error
-        vars(env).update(self._recordings)
-
-    def _compile(self) -> None:
-        try:
-            for recording in self._recordings.values():
-                recording.compile()
-        except CompileError as error:
-            self._error = error
+    more = {"_aim": env.posture.ATTRIBUTES, "_judge": env.ground.ATTRIBUTES}
+    recordings: dict[str, Recording] = {}
+    for name, (reads, writes) in _PARTS.items():
+        read, written = more.get(name, ((), ()))
+        recording = Recording(env, getattr(env, name), (*reads, *read), (*writes, *written), ("_state",))
+        recording.make(*([torch.zeros_like(env._actions, dtype=torch.float32)] if name == "_aim" else []))
+        recordings[name] = recording
+    vars(env).update(recordings)

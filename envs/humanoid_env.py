@@ -17,7 +17,7 @@ from torch import Tensor
 from eagle_rl.config.schema import TaskCfg
 from eagle_rl.errors import CompileError, EagleWarning
 
-from .control_step import ControlStep, Kernels
+from .control_step import ControlStep, compile_step
 from .ground import make_ground
 from .mdp.active_commands import ActiveCommands
 from .mdp.aids import LearningAids, harness_damping
@@ -143,8 +143,7 @@ class HumanoidEnv(ControlStep, VecEnv):
         self._last_contact = torch.zeros(n, 2, dtype=torch.bool, device=device)
         self._staged, self._causes = self.pool.staged(), self.pool.causes()
         self._reward_factors = self._weigh()
-        self._kernels: Kernels | None = None
-        self._kernels_from = 0
+        self._compile_at: int | None = None
         self._forget()
         (self._last_frame,) = self._sense()
         self.history = History(n, self.task.observations.history_length, self._last_frame)
@@ -163,9 +162,10 @@ class HumanoidEnv(ControlStep, VecEnv):
             physics took [s] (``physics_time``), and ``final_observations`` of the environments ``final_ids``, whose
             returns are to end there and be bootstrapped: they timed out, or get a new command or a push next.
         """
-        if self._kernels is not None and self.common_step_counter >= self._kernels_from:
+        if self._compile_at is not None and self.common_step_counter >= self._compile_at:
+            self._compile_at = None
             try:
-                self._adopt_kernels()
+                compile_step(self)
             except CompileError as error:
                 warnings.warn(f"{error} Training goes on without, a little slower.", EagleWarning, stacklevel=2)
         self._physics_step(*self._aim(actions))
@@ -190,20 +190,18 @@ class HumanoidEnv(ControlStep, VecEnv):
         return self.get_observations(), judged.rewards, dones, extras
 
     def compile(self, from_step: int | None = None) -> None:
-        """Compute steps by compiled kernels, equal up to rounding, see :class:`Kernels`.
+        """Take steps by compiled kernels, equal up to rounding, see :func:`compile_step`.
 
         Args:
-            from_step: control step since creation from which on to use them, so that they are compiled in the
-                background meanwhile, and if they cannot be, that is a warning; None waits for them now.
+            from_step: control step since creation from which on to do so; they are compiled then, and if they cannot
+                be, that is a warning. None compiles them now.
 
         Raises:
             CompileError: there is no C++ compiler, or it failed.
         """
-        self._kernels = Kernels(self)
+        self._compile_at = from_step
         if from_step is None:
-            self._adopt_kernels()
-        else:
-            self._kernels_from = from_step
+            compile_step(self)
 
     def reset(self) -> None:
         """Start new episodes everywhere; random streams go on."""
@@ -253,12 +251,6 @@ class HumanoidEnv(ControlStep, VecEnv):
         start = time.perf_counter()
         self._staged = self.pool.step(targets, wrench)
         self._physics_time = time.perf_counter() - start
-
-    def _adopt_kernels(self) -> None:
-        """Wait for the kernels and use them from now on."""
-        kernels, self._kernels = self._kernels, None
-        assert kernels is not None, "they are being compiled"
-        kernels.adopt(self)
 
     def _apply_aids(self) -> None:
         """Spread the aids' scales over the environments, and put the harness' share of the damping in force."""

@@ -68,7 +68,7 @@ class Recording:
         writes: Sequence[str] = (),
         scratch: Sequence[str] = (),
     ) -> None:
-        """Record and compile at the first call, unless :meth:`record` and :meth:`compile` came before.
+        """Record and compile at the first call or :meth:`make`.
 
         Args:
             owner: object whose attributes are read and written, by their paths.
@@ -86,10 +86,14 @@ class Recording:
         """Do what the method does."""
         if _Replay.in_the_making:
             return self._method(*args)
-        return self.record(*args)(*args)
+        return self.make(*args)(*args)
 
-    def record(self, *args: Tensor) -> _Replay:
-        """What is replayed for arguments like these and the attributes as they are, recorded at first."""
+    def make(self, *args: Tensor) -> _Replay:
+        """What is replayed for arguments like these and the attributes as they are, recorded and compiled at first.
+
+        Raises:
+            CompileError: there is no C++ compiler, or it failed.
+        """
         present = tuple(value is not None for value in self._look(self._owner))
         replay = self._replays.get(present)
         if replay is None:
@@ -98,15 +102,6 @@ class Recording:
                 self._owner, self._method, args, reads, self._writes, self._scratch
             )
         return replay
-
-    def compile(self) -> None:
-        """Compile what was recorded; nothing of the owner is looked at.
-
-        Raises:
-            CompileError: there is no C++ compiler, or it failed.
-        """
-        for replay in self._replays.values():
-            replay.compile()
 
     @property
     def graphs(self) -> list[fx.GraphModule]:
@@ -139,23 +134,15 @@ class _Replay:
         with torch.inference_mode(False), torch.no_grad():
             self._run(method, len(args), [x.clone() for x in inputs])  # makes the constants the method keeps
             self.graph = _record(lambda *tensors: self._run(method, len(args), tensors), inputs)
-        self._inputs = inputs
-        self._kernel: Callable[..., Sequence[Tensor]] | None = None
-
-    def compile(self) -> Callable[..., Sequence[Tensor]]:
-        """The kernel, compiled if it was not."""
-        if self._kernel is None:
-            self._kernel, self._inputs = _compiled(self.graph, self._inputs), []
-        return self._kernel
+        self._kernel = _compiled(self.graph, inputs)
 
     def __call__(self, *args: Tensor) -> Any:
-        kernel = self._kernel or self.compile()
         tensors = (*args, *self._collect(self._owner))
         inputs = [
             x if x.dtype == dtype and x.stride() == stride else x.to(dtype).contiguous()
             for x, (dtype, stride) in zip(tensors, self._kinds, strict=True)
         ]
-        results = iter(kernel(*inputs))
+        results = iter(self._kernel(*inputs))
         for attribute in self._writes:
             attribute.put(self._owner, results)
         kind, present = self._returned

@@ -251,9 +251,8 @@ class RunCfg:
     never on what else runs."""
     compile: Literal["auto", "always", "never"] = "auto"
     """Whether training takes the environments' steps by kernels compiled from their code, equal up to rounding.
-    ``auto`` does on a CPU, in stages of five million steps and more: it compiles in the background, half a minute of a
-    core, and uses the kernels from control step 1000 on. ``always`` waits for them before the first step
-    (docs/performance.md)."""
+    ``auto`` does on a CPU, in stages of five million steps and more, from control step 1000 on: compiling takes half a
+    minute, the next time a few seconds. ``always`` does from the first step on (docs/performance.md)."""
     save_interval: int = 50
     """Iterations between checkpoints."""
     keep_checkpoints: int = 3

@@ -9,7 +9,7 @@ from eagle_rl.config.schema import RunCfg
 WORTH_IT = 5_000_000
 """Environment steps from which on compiling saves more time than it takes [-] (docs/performance.md)."""
 FROM_STEP = 1000
-"""Control step from which on a run that does not wait for its kernels uses them: after a minute or more."""
+"""Control step at which kernels are compiled: a run that is only tried out ends before."""
 
 
 def compile_where_it_pays(env: Any, run: RunCfg, env_steps: int) -> None:

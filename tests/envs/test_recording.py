@@ -95,7 +95,7 @@ def test_recording_leaves_the_owner_as_it_was_and_results_share_no_memory() -> N
     tally = Tally()
     before = tally.pair
     add = record(tally)
-    add.record(torch.ones(2, 3))
+    add.make(torch.ones(2, 3))
     assert tally.pair is before
     assert tally.count.tolist() == [0, 0]
     add(torch.ones(2, 3))
@@ -108,7 +108,7 @@ def test_recording_leaves_the_owner_as_it_was_and_results_share_no_memory() -> N
 def test_methods_that_a_recorded_method_calls_are_recorded_with_it() -> None:
     tally = Tally()
     total = Recording(tally, tally.total, ("pair",))
-    total.record()
+    total.make()
     tally.total = total  # type: ignore[method-assign]
     assert record(tally)(torch.ones(2, 3)).total.tolist() == [12.0, 30.0]
     assert record(tally)(torch.ones(2, 3)).total.tolist() == [18.0, 36.0]
@@ -198,7 +198,7 @@ def test_a_recorded_environment_resumes_to_the_bit() -> None:
 
 
 @pytest.mark.usefixtures("uncompiled")
-def test_kernels_made_in_the_background_are_used_from_the_step_on_that_was_said() -> None:
+def test_kernels_are_used_from_the_step_on_that_was_said() -> None:
     env = make_env(num_envs=N)
     env.compile(from_step=3)
     for step in range(5):
@@ -206,7 +206,7 @@ def test_kernels_made_in_the_background_are_used_from_the_step_on_that_was_said(
         env.step(actions(N, step))
 
 
-def test_a_failure_in_the_background_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failure_in_the_middle_of_a_run_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CXX", "no-such-compiler")
     env = make_env(num_envs=2)
     env.compile(from_step=1)
