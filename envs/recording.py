@@ -21,7 +21,7 @@ from typing import Any, ClassVar, NamedTuple
 import torch
 from torch import Tensor, fx
 
-from eagle_rl.errors import CompileError
+from eagle_rl.errors import CompileError, EagleWarning
 
 Attributes = tuple[tuple[str, ...], tuple[str, ...]]
 """Paths of what a method reads and of what it writes."""
@@ -68,7 +68,7 @@ class Recording:
         writes: Sequence[str] = (),
         scratch: Sequence[str] = (),
     ) -> None:
-        """Record and compile at the first call or :meth:`make`.
+        """Record and compile at the first call or :meth:`make`; a call that cannot be compiled warns and is as before.
 
         Args:
             owner: object whose attributes are read and written, by their paths.
@@ -81,12 +81,21 @@ class Recording:
         self._reads, self._writes, self._scratch = tuple(reads), tuple(writes), tuple(scratch)
         self._look = _getter(self._reads)
         self._replays: dict[tuple[bool, ...], _Replay] = {}
+        self._gave_up = False
 
     def __call__(self, *args: Tensor) -> Any:
         """Do what the method does."""
         if _Replay.in_the_making:
             return self._method(*args)
-        return self.make(*args)(*args)
+        if self._gave_up:
+            return self._method(*args)
+        try:
+            replay = self.make(*args)
+        except CompileError as error:
+            self._gave_up = True
+            warnings.warn(f"{error} Training goes on without, a little slower.", EagleWarning, stacklevel=2)
+            return self._method(*args)
+        return replay(*args)
 
     def make(self, *args: Tensor) -> _Replay:
         """What is replayed for arguments like these and the attributes as they are, recorded and compiled at first.

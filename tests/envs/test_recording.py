@@ -123,15 +123,23 @@ def test_without_a_compiler_the_message_says_how_to_get_one(monkeypatch: pytest.
     env.step(actions(2, 0))
 
 
-def test_a_failing_compiler_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failing_compiler_is_reported_and_does_not_end_a_run(monkeypatch: pytest.MonkeyPatch) -> None:
     import torch._inductor as inductor
 
     def fail(*_: object) -> None:
         raise RuntimeError("ld: no space left")
 
     monkeypatch.setattr(inductor, "compile", fail)
+    add = record(Tally())
     with pytest.raises(CompileError, match="no space left"):
-        record(Tally())(torch.ones(2, 3))
+        add.make(torch.ones(2, 3))
+    plain, tally = Tally(), Tally()
+    add = record(tally)
+    with pytest.warns(EagleWarning, match="no space left"):
+        first = add(torch.ones(2, 3))
+    tally.mean = None
+    assert torch.equal(first.total, plain.add(torch.ones(2, 3)).total)
+    assert torch.equal(add(torch.ones(2, 3)).total, plain.add(torch.ones(2, 3)).total), "it warns once"
 
 
 def outcomes(env: HumanoidEnv, steps: int) -> Iterator[dict[str, Tensor]]:
