@@ -85,9 +85,7 @@ class Recording:
 
     def __call__(self, *args: Tensor) -> Any:
         """Do what the method does."""
-        if _Replay.in_the_making:
-            return self._method(*args)
-        if self._gave_up:
+        if _Replay.in_the_making or self._gave_up:
             return self._method(*args)
         try:
             replay = self.make(*args)
