@@ -14,7 +14,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from eagle_rl.algorithms.eagle_ppo import EaglePPO
 from eagle_rl.machine import own_cores
-from eagle_rl.models.shares import use_threads
+from eagle_rl.threads import use_threads
 from eagle_rl.runners.on_policy import EagleRunner
 
 from .budget import Budget

@@ -1,16 +1,11 @@
 """Methods of tensor arithmetic, recorded once and replayed as one compiled kernel.
 
 A control step calls some 400 small torch operations, and on a CPU their calls cost more than their arithmetic. The code
-stays as it is: a method is run once on tensors that take notes, TorchInductor compiles the notes into C++, and from
-then on the kernel does what the method did. Nothing is traced by reading Python, so that nothing the method does but
-tensor arithmetic may matter: it must not branch on values, count in Python, or draw constants for the first time.
+stays as it is: a method is recorded as a function of the attributes it reads (:mod:`eagle_rl.kernels`).
 """
 
 from __future__ import annotations
 
-import os
-import shutil
-import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -21,6 +16,7 @@ from typing import Any, ClassVar, NamedTuple
 import torch
 from torch import Tensor, fx
 
+from eagle_rl import kernels
 from eagle_rl.errors import CompileError, EagleWarning
 
 Attributes = tuple[tuple[str, ...], tuple[str, ...]]
@@ -140,8 +136,8 @@ class _Replay:
         self._kinds = [(x.dtype, x.stride()) for x in inputs]
         with torch.inference_mode(False), torch.no_grad():
             self._run(method, len(args), [x.clone() for x in inputs])  # makes the constants the method keeps
-            self.graph = _record(lambda *tensors: self._run(method, len(args), tensors), inputs)
-        self._kernel = _compiled(self.graph, inputs)
+            self.graph = kernels.record(lambda *tensors: self._run(method, len(args), tensors), inputs)
+        self._kernel = kernels.compile_graph(self.graph, inputs)
 
     def __call__(self, *args: Tensor) -> Any:
         tensors = (*args, *self._collect(self._owner))
@@ -186,50 +182,7 @@ class _Replay:
                 Attribute(attribute.path, None).put(self._owner, iter([value]))
 
 
-def find_compiler() -> str:
-    """The C++ compiler that TorchInductor will take.
-
-    Raises:
-        CompileError: it is not there.
-    """
-    name = os.getenv("CXX", "clang++" if sys.platform == "darwin" else "g++")
-    if shutil.which(name) is None:
-        raise CompileError(f"There is no C++ compiler {name!r}. On Debian: apt install g++; or name another in CXX.")
-    return name
-
-
 def _getter(paths: Sequence[str]) -> Callable[[object], tuple[Any, ...]]:
     """Looks up all these attributes in one call, which for many is far quicker than one by one."""
     get = attrgetter(*paths)
     return get if len(paths) > 1 else lambda owner: (get(owner),)
-
-
-def _record(function: Callable[..., list[Tensor]], inputs: Sequence[Tensor]) -> fx.GraphModule:
-    """The operations of a function on these tensors; what is neither among them nor made of them is a constant."""
-    from torch.fx.experimental.proxy_tensor import make_fx
-
-    graph: fx.GraphModule = make_fx(function)(*inputs)
-    return graph
-
-
-def _compiled(graph: fx.GraphModule, inputs: list[Tensor]) -> Callable[..., Sequence[Tensor]]:
-    """The graph as one C++ kernel, for inputs of just these shapes and strides.
-
-    Inductor keeps what it compiled on disk, where only a graph of fake tensors is looked up.
-    """
-    find_compiler()
-    from torch._guards import TracingContext, tracing
-    from torch._subclasses import FakeTensorMode
-    from torch.fx.experimental.symbolic_shapes import ShapeEnv
-
-    mode = FakeTensorMode(shape_env=ShapeEnv())
-    fakes: list[Any] = [mode.from_tensor(x, static_shapes=True) for x in inputs]
-    try:
-        with tracing(TracingContext(mode)), warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # torch warns of torch
-            from torch._inductor import compile as compile_graph
-
-            kernel: Callable[..., Sequence[Tensor]] = compile_graph(graph, fakes)
-    except Exception as error:  # whatever the compiler and those who drive it raise
-        raise CompileError(f"The step could not be compiled: {error}") from error
-    return kernel

@@ -14,7 +14,7 @@ import pytest
 import torch
 from hypothesis import Phase, settings
 
-from eagle_rl.models.shares import use_threads
+from eagle_rl.threads import use_threads
 
 phases = [Phase.explicit, Phase.generate, Phase.shrink]
 settings.register_profile("eagle", derandomize=True, deadline=None, database=None, print_blob=False, phases=phases)

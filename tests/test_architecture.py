@@ -19,11 +19,11 @@ ROOT = Path(__file__).resolve().parents[1]
 SOURCES = {path.relative_to(ROOT).as_posix(): ast.parse(path.read_text(encoding="utf-8"))
            for package in ("eagle_rl", "envs") for path in sorted((ROOT / package).rglob("*.py"))}  # fmt: skip
 
-LAYERS = (("config", "errors", "paths", "machine", "_version"), ("models",), ("algorithms",),
+LAYERS = (("config", "errors", "paths", "machine", "kernels", "threads", "_version"), ("models",), ("algorithms",),
           ("runners", "evaluation", "export"), ("cli",))  # fmt: skip
 RANK = {name: rank for rank, layer in enumerate(LAYERS) for name in layer}
 
-OPEN_TO_ENVS = ("eagle_rl.config", "eagle_rl.errors", "eagle_rl.paths")
+OPEN_TO_ENVS = ("eagle_rl.config", "eagle_rl.errors", "eagle_rl.paths", "eagle_rl.kernels")
 
 OWNERS = {
     "yaml": {"eagle_rl/config/yaml_file.py"},

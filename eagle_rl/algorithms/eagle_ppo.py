@@ -1,16 +1,9 @@
-"""PPO as EAGLE uses it: several losses in one backward pass, one learning-rate step an iteration, true bootstraps.
-
-``PPO.update`` of rsl_rl is used as it is. Its three extension points, none of them declared, are pinned by a test that
-compares the gradient of ``update`` with a hand-written sum of all losses:
-
-* the slot of the ``Symmetry`` extension, whose loss joins PPO's before the backward pass (:class:`AuxiliaryLosses`);
-* extra keys of the rollout's observations, which every minibatch carries along (the specialists' labels);
-* ``reduce_parameters``, called between backward pass and clipping where ``is_multi_gpu`` is set.
-"""
+"""PPO as EAGLE uses it: one sum of all losses, one learning-rate step an iteration, true bootstraps."""
 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping
 from typing import Any, Literal
 
@@ -20,16 +13,18 @@ from rsl_rl.env import VecEnv
 from rsl_rl.models import MLPModel
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
-from torch import Tensor
+from torch import Tensor, nn
 
-from eagle_rl.algorithms.auxiliary import AuxiliaryLosses, Distill, Estimation, Kickstart, Mirror
+from eagle_rl.algorithms.acting import Acting
+from eagle_rl.algorithms.gradient import KL, Gradient
 from eagle_rl.algorithms.rollout import Rollout
 from eagle_rl.algorithms.specialists import SpecialistBank
 from eagle_rl.algorithms.stopwatch import Stopwatch
+from eagle_rl.algorithms.terms import Distill, Estimation, Kickstart, Mirror, Ppo
 from eagle_rl.config.schema import AlgoCfg
 from eagle_rl.errors import HealthError
 from eagle_rl.models import EagleActor
-from eagle_rl.models.precision import multiplies_in_bfloat16, prepare_for_learning
+from eagle_rl.models.precision import keep_outputs_exact, multiplies_in_bfloat16
 
 MAX_SKIPPED_STEPS = 3
 """Non-finite gradients in a row after which learning stops."""
@@ -43,7 +38,7 @@ class EaglePPO(PPO):
     """PPO with estimation and mirror losses and, given specialists, with distillation or Kickstarting."""
 
     actor: EagleActor
-    symmetry: AuxiliaryLosses
+    storage: Rollout
 
     def __init__(
         self,
@@ -56,47 +51,41 @@ class EaglePPO(PPO):
         **unused: None,
     ) -> None:
         """Take over the models; ``unused`` are the extensions rsl_rl passes as None."""
-        ppo = 1.0 if cfg.use_ppo_loss else 0.0
         super().__init__(
             actor,
             critic,
             storage,
-            num_learning_epochs=cfg.num_learning_epochs,
-            num_mini_batches=cfg.num_mini_batches,
-            clip_param=cfg.clip_param,
             gamma=cfg.gamma,
             lam=cfg.lam,
-            value_loss_coef=ppo * cfg.value_loss_coef,
-            entropy_coef=ppo * cfg.entropy_coef,
             learning_rate=cfg.learning_rate,
-            max_grad_norm=cfg.max_grad_norm,
-            use_clipped_value_loss=cfg.use_clipped_value_loss,
-            schedule="fixed",
             use_mixed_precision=multiplies_in_bfloat16(cfg.precision, device),
             device=device,
             multi_gpu_cfg=multi_gpu_cfg,
         )
         for model in (actor, critic):
-            prepare_for_learning(model)
+            keep_outputs_exact(model)
         critic.requires_grad_(cfg.use_ppo_loss)  # imitation alone has nothing to teach it
         self.cfg = cfg
-        self.is_multi_gpu = True  # makes update() call reduce_parameters(), where gradients are checked
         self.specialists: SpecialistBank | None = None
         self.robot_names: list[str] = []
         self.num_updates = 0
         self.imitation_updates = math.inf
         """Updates over which imitation without PPO lowers its learning rate; for ever, unless told."""
+        self.compile_from = math.inf
+        """Update from which on gradients and actions are computed by compiled kernels, equal up to rounding."""
         self.skipped_steps = 0
         self._skipped_in_a_row = 0
         self._withheld_steps = 0
         self.stopwatch = Stopwatch()
-        self.symmetry = AuxiliaryLosses([], self.stopwatch)
+        self.gradient = Gradient(actor, critic, self.use_mixed_precision)
+        self.acting = Acting(actor, critic, self.use_mixed_precision)
+        if cfg.use_ppo_loss:
+            self.gradient.terms.append(Ppo(critic, cfg))
         groups = [
             {"params": list(actor.parameters()), "lr": cfg.learning_rate},
             {"params": list(critic.parameters()), "lr": cfg.critic_learning_rate},
         ]
         self.optimizer = torch.optim.Adam(groups, fused=True)
-        self.optimizer.register_step_post_hook(lambda *_: self._after_step())
 
     @staticmethod
     def construct_algorithm(obs: TensorDict, env: VecEnv, cfg: dict[str, Any], device: str) -> EaglePPO:
@@ -106,10 +95,11 @@ class EaglePPO(PPO):
         alg: EaglePPO = PPO.construct_algorithm(obs, env, cfg | {"actor": actor}, device)
         alg.storage = Rollout("rl", env.num_envs, cfg["num_steps_per_env"], obs, [env.num_actions], device)
         alg.robot_names = list(env.robot_names)
-        if alg.cfg.estimation_coef > 0:
-            alg.symmetry.terms.append(Estimation(alg.cfg.estimation_coef))
-        if alg.cfg.mirror_coef > 0 and not symmetric:
-            alg.symmetry.terms.append(Mirror(alg.cfg.mirror_coef, alg.cfg.mirror_fraction, env.mirror, device))
+        algo, terms = alg.cfg, alg.gradient.terms
+        if algo.estimation_coef > 0:
+            terms.append(Estimation(algo.estimation_coef))
+        if algo.mirror_coef > 0 and not symmetric:
+            terms.append(Mirror(alg.actor, algo.mirror_coef, algo.mirror_fraction, env.mirror, device))
         return alg
 
     def imitate(self, specialists: SpecialistBank, method: Literal["eagle", "kickstart"]) -> None:
@@ -118,18 +108,19 @@ class EaglePPO(PPO):
         cfg = self.cfg
         if method == "eagle":
             in_noise_units = cfg.action_loss_unit == "noise"
-            self.symmetry.terms.append(
+            self.gradient.terms.append(
                 Distill(cfg.action_loss_coef, cfg.embedding_loss_coef, self.robot_names, in_noise_units)
             )
         else:
-            self.symmetry.terms.append(
-                Kickstart(lambda: cfg.kickstart_coef * math.exp(-cfg.kickstart_decay * self.num_updates))
-            )
+            self.gradient.terms.append(Kickstart(cfg.kickstart_coef, cfg.kickstart_decay))
 
     def act(self, obs: TensorDict) -> Tensor:
-        """Sample actions, computed as the update will compute them, so that its importance ratios start at one."""
-        with torch.autocast(torch.device(self.device).type, torch.bfloat16, self.use_mixed_precision):
-            return super().act(obs)
+        """Sample actions, shape (N, 32), and keep what the update wants to know of them."""
+        decision, step = self.acting(obs), self.transition
+        step.hidden_states, step.observations = (None, None), obs
+        step.actions, step.values, step.actions_log_prob = decision.actions, decision.value, decision.log_prob
+        step.distribution_params = (decision.mean, decision.std)
+        return decision.actions
 
     def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: Mapping[str, Any]) -> None:
         """Record one step; where the environment cuts returns, the value of the true final observation goes on."""
@@ -141,48 +132,66 @@ class EaglePPO(PPO):
         super().process_env_step(obs, rewards, dones, {})
 
     def compute_returns(self, obs: TensorDict) -> None:
-        """Compute returns and advantages; pure imitation has no use for advantages."""
+        """Compute returns and advantages; those of all processes are normalized together."""
         super().compute_returns(obs)
-        if not self.cfg.use_ppo_loss:
-            self.storage.advantages.zero_()
-        elif self.gpu_world_size > 1:
+        if self.gpu_world_size > 1:
             self._normalize_over_processes()
 
     def update(self) -> dict[str, float]:
         """Label the rollout, optimise the sum of all losses, adapt the learning rate; return scalars by tag."""
         if self.specialists is not None:
             self.storage.observations.update(self.specialists.label(self.storage.observations))
-        losses = super().update()
-        del losses["symmetry"]
-        kl = self._mean_over_processes(self.symmetry.pop_kl(self.num_mini_batches))
+        if self.num_updates >= self.compile_from:
+            self.gradient.compile()
+            self.acting.compile()
+        told, kls = self._learn()
+        self.storage.clear()
         self.num_updates += 1
+        kl = sum(kls[-self.cfg.num_mini_batches :]) / self.cfg.num_mini_batches
         if self.cfg.use_ppo_loss:
             self._adapt_learning_rate(kl)
         else:  # imitation alone has no trust region to stay in
             self._anneal_learning_rate()
         withheld, self._withheld_steps = self._withheld_steps, 0
-        scalars = {f"Loss/{name}": value for name, value in losses.items()} | self.symmetry.pop_means()
         counts = {"Health/skipped_updates": self.skipped_steps, "Loss/withheld_steps": withheld}
-        return scalars | {"Loss/kl": kl} | {tag: float(count) for tag, count in counts.items()}
+        return told | {KL: kl} | {tag: float(count) for tag, count in counts.items()}
 
-    def reduce_parameters(self) -> None:
-        """Average the gradients over processes; drop them, so that the step does nothing, where they do harm.
+    def _learn(self) -> tuple[dict[str, float], list[float]]:
+        """Take a step for each minibatch of each epoch; return means by tag and the KL of each minibatch."""
+        cfg, sums, kls = self.cfg, Counter[str](), []
+        num_shares = self.gradient.num_shares(self.storage.actions[..., 0].numel() // cfg.num_mini_batches)
+        now = torch.tensor(float(self.num_updates), device=self.device)
+        for shares in self.storage.minibatches(
+            cfg.num_mini_batches, cfg.num_learning_epochs, num_shares, num_updates=now
+        ):
+            told = self.gradient(shares)
+            self.stopwatch.lap("gradient")
+            total, weight = told[KL]
+            kls.append(self._mean_over_processes(total / weight))
+            self._step(kls[-1])
+            self.stopwatch.lap("optimiser")
+            for tag, entry in told.items():
+                sums[tag] = sums[tag] + entry
+        means = {tag: total / weight for tag, (total, weight) in ((tag, x.tolist()) for tag, x in sums.items()) if weight}
+        return means, kls
 
-        That is where they are not finite, and where the policy has already left the region PPO's loss is good for.
+    def _step(self, kl: float) -> None:
+        """Step along the gradient averaged over processes, unless that does harm.
+
+        It does where the gradient is not finite, and where the policy has already left the region PPO's loss is good for:
+        one more step may wreck it.
         """
-        self.stopwatch.lap("backward")
         if self.gpu_world_size > 1:
-            super().reduce_parameters()
-        if self._too_far():
-            self.optimizer.zero_grad(set_to_none=True)
+            self.reduce_parameters()
+        if self.cfg.use_ppo_loss and kl > MAX_KL_RATIO * self.cfg.desired_kl:
             self._withheld_steps += 1
             return
-        parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
-        grads = [p.grad for p in parameters if p.grad is not None]
-        if torch.isfinite(torch.nn.utils.get_total_norm(grads)):
+        norms = [self._clipped(model) for model in (self.actor, self.critic)]
+        if torch.isfinite(torch.stack(norms)).all():
             self._skipped_in_a_row = 0
+            self.optimizer.step()
+            self.actor.distribution.project_std()
             return
-        self.optimizer.zero_grad(set_to_none=True)
         self.skipped_steps += 1
         self._skipped_in_a_row += 1
         if self._skipped_in_a_row == MAX_SKIPPED_STEPS:
@@ -191,6 +200,13 @@ class EaglePPO(PPO):
                 "The parameters are those before. Look at Loss/* and at the rewards of the last iterations; "
                 "a smaller algo.learning_rate or algo.max_grad_norm often helps."
             )
+
+    def _clipped(self, model: nn.Module) -> Tensor:
+        """Shorten the gradient of a model's parameters to the length allowed; return the length it had, a scalar."""
+        parameters = [p for p in model.parameters() if p.grad is not None]
+        norm = torch.nn.utils.get_total_norm([p.grad for p in parameters if p.grad is not None])
+        torch.nn.utils.clip_grads_with_norm_(parameters, self.cfg.max_grad_norm, norm)
+        return norm
 
     def save(self) -> dict[str, Any]:
         """Models, optimiser and counters, for :meth:`load`."""
@@ -214,16 +230,6 @@ class EaglePPO(PPO):
         """
         self.critic.load_state_dict(learner["critic_state_dict"])
         self.learning_rate = self.optimizer.param_groups[0]["lr"] = learner["learning_rate"]
-
-    def _too_far(self) -> bool:
-        """Whether this update has moved the policy so far from the one that acted that one more step may wreck it."""
-        if not self.cfg.use_ppo_loss:
-            return False
-        return self._mean_over_processes(self.symmetry.last_kl.clone()) > MAX_KL_RATIO * self.cfg.desired_kl
-
-    def _after_step(self) -> None:
-        self._raw_actor.distribution.project_std()
-        self.stopwatch.lap("optimiser")
 
     def _adapt_learning_rate(self, kl: float) -> None:
         """Lower the actor's learning rate where the last epoch moved the policy too far, raise it where too little."""

@@ -1,7 +1,8 @@
-"""The losses added to PPO's, as pure functions.
+"""Every loss, row by row, as a pure function.
 
-N rows, S slots; ``mask`` (N, S) is 1 in live slots. Every reduction is a mean over rows and over live slots or
-dimensions (the paper prints expectations without stating the reduction; see docs/decisions.md).
+N rows, S slots; ``mask`` (N, S) is 1 in live slots. A loss is the mean of its rows over the minibatch. ``live`` is how
+many live slots a row has on average over the minibatch, so that the mean of rows that are sums over slots divided by
+``live`` is one over live slots (the paper prints expectations without stating the reduction; see docs/decisions.md).
 """
 
 from __future__ import annotations
@@ -13,14 +14,28 @@ BASE_VELOCITY_DIM = 3
 """Leading entries of the estimate; the embodiment observation o_ea follows."""
 
 
-def masked_mse(difference: Tensor, mask: Tensor) -> Tensor:
-    """Mean square of ``difference`` (N, S) over live slots, scalar."""
-    return (difference.square() * mask).sum() / mask.sum()
+def surrogate_loss(log_ratio: Tensor, advantage: Tensor, clip: float) -> Tensor:
+    """PPO's -min(r A, clip(r, 1 - clip, 1 + clip) A) with r = exp(``log_ratio``), shapes (N,)."""
+    ratio = torch.exp(log_ratio)
+    return -torch.min(ratio * advantage, ratio.clamp(1.0 - clip, 1.0 + clip) * advantage)
 
 
-def action_loss(mean: Tensor, teacher_mean: Tensor, mask: Tensor) -> Tensor:
-    """L_a, paper Eq. 7: (pi_g(o_t) - pi_s(o_t))^2 on action means (N, S)."""
-    return masked_mse(mean - teacher_mean, mask)
+def value_loss(value: Tensor, target: Tensor, old_value: Tensor, clip: float | None = None) -> Tensor:
+    """(V - R)^2, shape (N,); with ``clip`` the larger of it and that of V no further than ``clip`` from the old V."""
+    loss = (value - target).square()
+    if clip is None:
+        return loss
+    return torch.max(loss, (old_value + (value - old_value).clamp(-clip, clip) - target).square())
+
+
+def masked_square(difference: Tensor, mask: Tensor, live: Tensor) -> Tensor:
+    """Rows (N,) whose mean is the mean square of ``difference`` (N, S) over live slots."""
+    return (difference.square() * mask).sum(dim=1) / live
+
+
+def action_loss(mean: Tensor, teacher_mean: Tensor, mask: Tensor, live: Tensor) -> Tensor:
+    """L_a, paper Eq. 7: (pi_g(o_t) - pi_s(o_t))^2 on action means (N, S); shape (N,)."""
+    return masked_square(mean - teacher_mean, mask, live)
 
 
 def in_noise_units(action: Tensor, teacher_std: Tensor, mask: Tensor) -> Tensor:
@@ -29,24 +44,26 @@ def in_noise_units(action: Tensor, teacher_std: Tensor, mask: Tensor) -> Tensor:
 
 
 def embedding_loss(embedding: Tensor, teacher_embedding: Tensor) -> Tensor:
-    """L_e, paper Eq. 8: (e_g(s_t) - e_s(s_t))^2 on embeddings (N, E)."""
-    return (embedding - teacher_embedding).square().mean()
+    """L_e, paper Eq. 8: (e_g(s_t) - e_s(s_t))^2 on embeddings (N, E), a mean over E; shape (N,)."""
+    return (embedding - teacher_embedding).square().mean(dim=1)
 
 
 def estimation_loss(estimate: Tensor, target: Tensor) -> Tensor:
-    """MSE of the base velocity plus MSE of o_ea, each a mean over its own dimensions (HugWBC 6).
+    """MSE of the base velocity plus MSE of o_ea, each a mean over its own dimensions (HugWBC 6), shape (N,).
 
-    Shapes (N, 33), or (N, 3) without embodiment observation.
+    Arguments are (N, 33), or (N, 3) without embodiment observation.
     """
     error = (estimate - target).square()
-    loss = error[:, :BASE_VELOCITY_DIM].mean()
+    loss = error[:, :BASE_VELOCITY_DIM].mean(dim=1)
     if error.shape[1] > BASE_VELOCITY_DIM:
-        loss = loss + error[:, BASE_VELOCITY_DIM:].mean()
+        loss = loss + error[:, BASE_VELOCITY_DIM:].mean(dim=1)
     return loss
 
 
-def mirror_loss(mean: Tensor, mean_of_mirrored: Tensor, perm: Tensor, sign: Tensor, mask: Tensor) -> Tensor:
-    """(stopgrad(mu(o)) - M_a mu(M_o o))^2 (HugWBC 6).
+def mirror_loss(
+    mean: Tensor, mean_of_mirrored: Tensor, perm: Tensor, sign: Tensor, mask: Tensor, live: Tensor
+) -> Tensor:
+    """(stopgrad(mu(o)) - M_a mu(M_o o))^2 (HugWBC 6), shape (N,).
 
     Args:
         mean: mu(o), shape (N, S); receives no gradient.
@@ -54,14 +71,15 @@ def mirror_loss(mean: Tensor, mean_of_mirrored: Tensor, perm: Tensor, sign: Tens
         perm: slot whose value the mirrored robot has in each slot, shape (S,).
         sign: its sign, shape (S,).
         mask: live slots of o's robot, shape (N, S).
+        live: see the module.
     """
-    return masked_mse(mean.detach() - mean_of_mirrored[:, perm] * sign, mask)
+    return masked_square(mean.detach() - mean_of_mirrored[:, perm] * sign, mask, live)
 
 
 def kickstarting_loss(teacher_mean: Tensor, teacher_std: Tensor, mean: Tensor, std: Tensor, mask: Tensor) -> Tensor:
-    """KL(pi_s || pi_g) of Gaussians over live slots [nat], mean over rows (Kickstarting baseline of the paper)."""
+    """KL(pi_s || pi_g) of Gaussians (N, S) over live slots [nat], shape (N,) (Kickstarting baseline of the paper)."""
     absent = 1 - mask
     teacher_std, std = teacher_std + absent, std + absent
     variance_ratio = (teacher_std / std).square()
     distance = ((teacher_mean - mean) / std).square()
-    return 0.5 * (variance_ratio + distance - 1 - torch.log(variance_ratio)).sum(dim=-1).mean()
+    return 0.5 * (variance_ratio + distance - 1 - torch.log(variance_ratio)).sum(dim=1)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import time
 
-SECTIONS = ("physics", "MDP", "inference", "storage", "forward", "backward", "optimiser", "logging")
-"""Parts of an iteration: ``physics`` includes checking and gathering the states, ``forward`` gathering minibatches and
-all losses. On a GPU a part's time is that of asking for it."""
+SECTIONS = ("physics", "MDP", "inference", "storage", "gradient", "optimiser", "logging")
+"""Parts of an iteration: ``physics`` includes checking and gathering the states, ``gradient`` gathering minibatches
+and the forward and backward passes of all losses. On a GPU a part's time is that of asking for it."""
 
 
 class Stopwatch:

@@ -97,7 +97,7 @@ def _fault(load: Callable[[str], object], name: str) -> str:
 
 def check_compiler() -> list[Finding]:
     """Whether steps can be compiled; long training is a little quicker with."""
-    from envs.recording import find_compiler
+    from eagle_rl.kernels import find_compiler
 
     try:
         return [Finding("compiler", "ok", find_compiler())]

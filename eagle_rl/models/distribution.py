@@ -2,12 +2,34 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
 from rsl_rl.modules.distribution import GaussianDistribution
 from torch import Tensor
-from torch.distributions import Normal, kl_divergence
+from torch.distributions import Normal
+
+_LOG_SQRT_2_PI = 0.5 * math.log(2.0 * math.pi)
+
+
+def log_prob(actions: Tensor, mean: Tensor, std: Tensor, mask: Tensor) -> Tensor:
+    """Log-probability of actions (N, S) over live slots of a Gaussian with ``std`` (S,), shape (N,)."""
+    distance = (actions - mean) / std
+    return ((-0.5 * distance.square() - std.log() - _LOG_SQRT_2_PI) * mask).sum(dim=-1)
+
+
+def entropy(std: Tensor, mask: Tensor) -> Tensor:
+    """Entropy over live slots [nat] of a Gaussian with ``std`` (S,), shape (N,)."""
+    return ((std.log() + 0.5 + _LOG_SQRT_2_PI) * mask).sum(dim=-1)
+
+
+def kl_divergence(old_mean: Tensor, old_std: Tensor, mean: Tensor, std: Tensor) -> Tensor:
+    """KL(old || new) over live slots [nat], shape (N,), of (N, S) each; absent slots have mean and std 0 in both."""
+    absent = (old_std == 0).to(old_std.dtype)
+    old_std, std = old_std + absent, std + absent
+    ratio = (old_std / std).square()
+    return 0.5 * (ratio + ((old_mean - mean) / std).square() - 1.0 - ratio.log()).sum(dim=-1)
 
 
 class MaskedGaussian(GaussianDistribution):
@@ -43,21 +65,15 @@ class MaskedGaussian(GaussianDistribution):
     @property
     def entropy(self) -> Tensor:
         """Entropy over live slots [nat], shape (N,)."""
-        return (self._distribution.entropy() * self.mask).sum(dim=-1)
+        return entropy(self._distribution.stddev, self.mask)
 
     def log_prob(self, outputs: Tensor) -> Tensor:
         """Log-probability of actions over live slots, shape (N,)."""
-        return (self._distribution.log_prob(outputs) * self.mask).sum(dim=-1)
+        return log_prob(outputs, self._distribution.mean, self._distribution.stddev, self.mask)
 
     def kl_divergence(self, old_params: tuple[Tensor, ...], new_params: tuple[Tensor, ...]) -> Tensor:
-        """KL(old || new) over live slots [nat], shape (N,).
-
-        Both are pairs (mean, std) of shape (N, 32) of the same robots. A slot whose old std is 0 is absent; giving it
-        std 1 on both sides makes its term exactly 0.
-        """
-        absent = (old_params[1] == 0).to(old_params[1].dtype)
-        old, new = (Normal(mean, std + absent) for mean, std in (old_params, new_params))
-        return kl_divergence(old, new).sum(dim=-1)
+        """KL(old || new) over live slots [nat], shape (N,); both are pairs (mean, std) of shape (N, 32)."""
+        return kl_divergence(*old_params, *new_params)
 
     @torch.no_grad()
     def project_std(self) -> None:

@@ -8,7 +8,7 @@ import torch
 from rsl_rl.modules import MLP
 from torch import Tensor, nn
 
-from eagle_rl.models.shares import share_rows, use_threads
+from eagle_rl.threads import use_threads
 
 Precision = Literal["auto", "float32", "bfloat16"]
 
@@ -39,12 +39,6 @@ class OutputLayer(nn.Linear):
             return super().forward(input.to(self.weight.dtype))
 
 
-def prepare_for_learning(model: nn.Module) -> None:
-    """Let a model's networks share rows out among threads, and autocast change what is inside them."""
-    keep_outputs_exact(model)
-    share_rows(model)
-
-
 def keep_outputs_exact(model: nn.Module) -> None:
     """Let autocast change only the hidden layers of a model's networks, not what leaves them."""
     for network in list(model.modules()):
@@ -55,7 +49,7 @@ def keep_outputs_exact(model: nn.Module) -> None:
 def set_up_torch(num_threads: int) -> None:
     """Learn with so many threads, and multiply float32 matrices by oneDNN wherever that is exact.
 
-    Each computes with one thread of torch's, and so does all that is not shared out (:mod:`eagle_rl.models.shares`).
+    Each computes with one thread of torch's, and so does all that is not shared out (:mod:`eagle_rl.threads`).
 
     torch's default, MKL, leaves AVX-512 unused on AMD's processors, where oneDNN is more than twice as fast. torch
     takes oneDNN only if bfloat16 is allowed inside a product. Processors without AMX make no use of that permission; it

@@ -163,7 +163,7 @@ class EagleRunner(OnPolicyRunner):
         steps = self.cfg["num_steps_per_env"] * self.env.num_envs * self.gpu_world_size
         self.env_steps += steps
         self.wall_time += learned - start
-        std = self.alg.actor.output_std
+        std = self.alg.storage.distribution_params[1]
         own = {
             "Loss/learning_rate": self.alg.learning_rate,
             "Policy/mean_std": (std.sum() / (std > 0).sum()).item(),

@@ -144,8 +144,8 @@ def _average(job: Job) -> Path:
 def _make_runner(job: Job) -> EagleRunner:
     """The runner of a stage, its specialists loaded."""
     cfg, stage = job.cfg, job.stage
-    env: VecEnv = job.make_env(stage.robots, cfg.num_envs, cfg.task, stage.seed + job.rank)
-    compile_where_it_pays(env, cfg.run, stage.env_steps)
+    simulation: VecEnv = job.make_env(stage.robots, cfg.num_envs, cfg.task, stage.seed + job.rank)
+    env = simulation
     acting_base = _load(job.base, cfg.run.env_device)
     history = cfg.task.observations.history_length
     if stage.demonstrations:
@@ -159,6 +159,7 @@ def _make_runner(job: Job) -> EagleRunner:
     bank = _teachers(job, base, cfg.run.device)
     train_cfg = make_train_cfg(cfg.algo, cfg.run, history_length=history, seed=stage.seed)
     runner = EagleRunner(env, train_cfg, job.folder, cfg.run.device, job.provenance)
+    compile_where_it_pays(simulation, runner.alg, cfg.run, stage.env_steps)
     if bank is not None and stage.imitation is not None:
         runner.alg.imitate(bank, stage.imitation)
         runner.alg.imitation_updates = stage.iterations

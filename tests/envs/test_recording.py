@@ -10,9 +10,9 @@ import pytest
 import torch
 from torch import Tensor, fx
 
+from eagle_rl import kernels
 from eagle_rl.config.schema import AidsCfg, CommandsCfg, ControlCfg, ObservationsCfg, TaskCfg, TerrainCfg
 from eagle_rl.errors import CompileError, EagleWarning
-from envs import recording
 from envs.humanoid_env import HumanoidEnv
 from envs.recording import Recording
 from tests.envs.worlds import actions, assert_same, make_env
@@ -67,7 +67,7 @@ def uncompiled(monkeypatch: pytest.MonkeyPatch) -> None:
     def as_it_is(graph: fx.GraphModule, inputs: list[Tensor]) -> fx.GraphModule:
         return graph
 
-    monkeypatch.setattr(recording, "_compiled", as_it_is)
+    monkeypatch.setattr(kernels, "compile_graph", as_it_is)
 
 
 @pytest.mark.usefixtures("uncompiled")
@@ -126,7 +126,7 @@ def test_without_a_compiler_the_message_says_how_to_get_one(monkeypatch: pytest.
 def test_a_failing_compiler_is_reported_and_does_not_end_a_run(monkeypatch: pytest.MonkeyPatch) -> None:
     import torch._inductor as inductor
 
-    def fail(*_: object) -> None:
+    def fail(*_: object, **__: object) -> None:
         raise RuntimeError("ld: no space left")
 
     monkeypatch.setattr(inductor, "compile", fail)

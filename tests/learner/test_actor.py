@@ -150,7 +150,7 @@ def test_another_last_layer_acts_on_both_sides(obs):
 
 
 def test_a_two_sided_policy_needs_no_mirror_loss():
-    names = [type(term).__name__ for term in make_runner().alg.symmetry.terms]
+    names = [type(term).__name__ for term in make_runner().alg.gradient.terms]
     assert "Mirror" in names
     symmetric = make_runner(network=dataclasses.replace(NETWORK, symmetric=True))
-    assert [type(term).__name__ for term in symmetric.alg.symmetry.terms] == [n for n in names if n != "Mirror"]
+    assert [type(term).__name__ for term in symmetric.alg.gradient.terms] == [n for n in names if n != "Mirror"]

@@ -3,7 +3,9 @@ from __future__ import annotations
 import pytest
 import torch
 
+from eagle_rl.algorithms.terms import Policy
 from eagle_rl.models import precision
+from eagle_rl.models.distribution import log_prob
 from eagle_rl.runners.on_policy import EagleRunner
 from tests.learner.helpers import collect, make_runner
 
@@ -63,11 +65,10 @@ def test_importance_ratios_start_at_one_and_outputs_are_float32():
     runner = make_runner(precision="bfloat16")
     collect(runner)
     alg = runner.alg
-    batch = next(alg.storage.mini_batch_generator(4, 1))
+    (share,) = next(alg.storage.minibatches(4, 1))
     with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
-        alg.actor(batch.observations, stochastic_output=True)
-        log_ratio = alg.actor.get_output_log_prob(batch.actions) - batch.old_actions_log_prob[:, 0]
-        values = alg.critic(batch.observations)
-    assert log_ratio.abs().max() < 0.01
-    for output in (alg.actor.output_mean, alg.actor.embedding, alg.actor.estimate, values):
+        policy, values = Policy.of(alg.actor, share), alg.critic(share)
+        new = log_prob(share["actions"], policy.mean, policy.std, share["slot_mask"])
+    assert (new - share["old_log_prob"]).abs().max() < 0.01
+    for output in (policy.mean, policy.embedding, policy.estimate, values):
         assert output.dtype == torch.float32

@@ -272,7 +272,7 @@ def test_a_run_says_now_and_then_where_its_time_goes(capsys):
         for iteration in range(1, 2 * BUDGET_INTERVAL):
             progress.update(iteration, 1, times | {"Perf/total_fps": 1.0, "Perf/busy_cores": 1.25})
     (line,) = capsys.readouterr().out.splitlines()
-    assert line.startswith("ppo time: physics 30%, MDP 10%, ")
+    assert line.startswith("ppo time: physics 33%, MDP 11%, ")
     assert line.endswith(" | 1.2 cores busy")
 
 

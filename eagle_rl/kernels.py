@@ -1,0 +1,73 @@
+"""Tensor arithmetic, recorded once and compiled into one kernel by TorchInductor.
+
+A function of tensors is run once on tensors that take notes; the notes are compiled into C++, and from then on the
+kernel does what the function did. Nothing is traced by reading Python, so that nothing the function does but tensor
+arithmetic may matter: it must not branch on values, count in Python, or draw constants for the first time.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+import warnings
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from torch import Tensor, fx
+
+from eagle_rl.errors import CompileError
+
+Kernel = Callable[..., Sequence[Tensor]]
+"""Takes tensors of just the shapes, types and strides it was made for."""
+
+
+def find_compiler() -> str:
+    """The C++ compiler that TorchInductor will take.
+
+    Raises:
+        CompileError: it is not there.
+    """
+    name = os.getenv("CXX", "clang++" if sys.platform == "darwin" else "g++")
+    if shutil.which(name) is None:
+        raise CompileError(f"There is no C++ compiler {name!r}. On Debian: apt install g++; or name another in CXX.")
+    return name
+
+
+def record(function: Callable[..., list[Tensor]], inputs: Sequence[Tensor]) -> fx.GraphModule:
+    """The operations of a function on these tensors; what is neither among them nor made of them is a constant."""
+    from torch.fx.experimental.proxy_tensor import make_fx
+
+    graph: fx.GraphModule = make_fx(function)(*inputs)
+    return graph
+
+
+def compile_graph(graph: fx.GraphModule, inputs: Sequence[Tensor], by_threads: bool = False) -> Kernel:
+    """The graph as one C++ kernel, for inputs of just these shapes and strides.
+
+    Inductor keeps what it compiled on disk, where only a graph of fake tensors is looked up.
+
+    Args:
+        graph: what :func:`record` returned.
+        inputs: tensors like those it will get.
+        by_threads: whether several threads will call it at a time; its calls then leave Python alone.
+
+    Raises:
+        CompileError: there is no C++ compiler, or it failed.
+    """
+    find_compiler()
+    from torch._guards import TracingContext, tracing
+    from torch._subclasses import FakeTensorMode
+    from torch.fx.experimental.symbolic_shapes import ShapeEnv
+
+    mode = FakeTensorMode(shape_env=ShapeEnv())
+    fakes: list[Any] = [mode.from_tensor(x, static_shapes=True) for x in inputs]
+    try:
+        with tracing(TracingContext(mode)), warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # torch warns of torch
+            from torch._inductor import compile as compile_with_inductor
+
+            kernel: Kernel = compile_with_inductor(graph, fakes, options={"cpp_wrapper": by_threads})
+    except Exception as error:  # whatever the compiler and those who drive it raise
+        raise CompileError(f"The kernel could not be compiled: {error}") from error
+    return kernel
