@@ -16,7 +16,8 @@ def profile(num_envs: int, threads: int, iterations: int = 5) -> list[Figure]:
     """
     cfg = experiment(threads)
     runner = make_runner(cfg, make_env(cfg, num_envs))
-    runner.learn(1)
+    runner.alg.compile_from = 0
+    runner.learn(2)
     seconds: Counter[str] = Counter()
 
     def add(_: int) -> None:

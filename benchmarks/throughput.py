@@ -112,7 +112,7 @@ def _part(product: tuple[Product, int], threads: int) -> tuple[Product, int]:
 
 
 def _products_of_update(runner: EagleRunner) -> _Multiplying:
-    """Train for an iteration and see what its update multiplies, which only its own thread can be asked for."""
+    """Train for an iteration by the code as it is, whose products can be seen, in the only thread that sees them."""
     counted, update = _Products(), runner.alg.update
 
     def counting() -> dict[str, float]:
@@ -133,6 +133,7 @@ def iteration(num_envs: int, threads: int, iterations: int) -> list[Figure]:
     env = make_env(cfg, num_envs)
     runner, bare = make_runner(cfg, env), BarePhysics(env)
     products = _products_of_update(runner)
+    runner.alg.compile_from = 0
     budget, wall = Budget(), []
     for owner, method, section in (
         (EaglePPO, "update", "update"),

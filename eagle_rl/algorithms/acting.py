@@ -46,7 +46,7 @@ class Acting:
         tensors = {group: obs[group].contiguous() for group in self._groups}
         tensors["noise"] = torch.randn_like(tensors["slot_mask"])
         (found,) = self._shared([Share(tensors, index=0, count=1, size=len(tensors["noise"]))])
-        return Decision(*(x for x in found if x is not None))
+        return Decision(*found)
 
 
 class _Acting(Computation):

@@ -13,7 +13,7 @@ from rsl_rl.env import VecEnv
 from rsl_rl.models import MLPModel
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
-from torch import Tensor, nn
+from torch import Tensor
 
 from eagle_rl.algorithms.acting import Acting
 from eagle_rl.algorithms.gradient import KL, Gradient
@@ -186,8 +186,7 @@ class EaglePPO(PPO):
         if self.cfg.use_ppo_loss and kl > MAX_KL_RATIO * self.cfg.desired_kl:
             self._withheld_steps += 1
             return
-        norms = [self._clipped(model) for model in (self.actor, self.critic)]
-        if torch.isfinite(torch.stack(norms)).all():
+        if torch.isfinite(self.gradient.clip(self.cfg.max_grad_norm)).all():
             self._skipped_in_a_row = 0
             self.optimizer.step()
             self.actor.distribution.project_std()
@@ -200,13 +199,6 @@ class EaglePPO(PPO):
                 "The parameters are those before. Look at Loss/* and at the rewards of the last iterations; "
                 "a smaller algo.learning_rate or algo.max_grad_norm often helps."
             )
-
-    def _clipped(self, model: nn.Module) -> Tensor:
-        """Shorten the gradient of a model's parameters to the length allowed; return the length it had, a scalar."""
-        parameters = [p for p in model.parameters() if p.grad is not None]
-        norm = torch.nn.utils.get_total_norm([p.grad for p in parameters if p.grad is not None])
-        torch.nn.utils.clip_grads_with_norm_(parameters, self.cfg.max_grad_norm, norm)
-        return norm
 
     def save(self) -> dict[str, Any]:
         """Models, optimiser and counters, for :meth:`load`."""

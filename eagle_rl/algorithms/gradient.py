@@ -19,28 +19,42 @@ KL = "Loss/kl"
 
 
 class Gradient:
-    """Puts the gradient of the sum of all terms into the parameters of actor and critic."""
+    """Puts the gradient of the sum of all terms into the parameters of actor and critic.
+
+    It is one vector, of which each parameter's is a view: to add up and to measure dozens of tensors takes longer.
+    """
 
     def __init__(self, actor: EagleActor, critic: MLPModel, mixed_precision: bool) -> None:
         """Start without terms; with ``mixed_precision`` hidden layers multiply in bfloat16."""
         self._loss = _Loss(actor, critic, mixed_precision)
         self._shared = Shared(self._loss)
+        self._parts: Sequence[Tensor] = ()
         self.terms: list[Term] = self._loss.terms
         """What is summed; complete before the first minibatch."""
         self.num_shares = self._shared.num_shares
         self.compile = self._shared.compile
 
     def __call__(self, shares: Sequence[Share]) -> dict[str, Tensor]:
-        """Put the gradient of the loss on a minibatch into the parameters; None where it does not depend on one.
+        """Put the gradient of the loss on a minibatch into the parameters it depends on.
 
         Returns:
             Unweighted losses by tag: sum and weight, shape (2,).
         """
-        *gradients, sums = (_sum(same) for same in zip(*self._shared(shares), strict=True))
-        for parameter, gradient in zip(self._loss.parameters(), gradients, strict=True):
-            parameter.grad = gradient
-        assert sums is not None, "the KL is always told"
+        vector, sums = (reduce(torch.add, same) for same in zip(*self._shared(shares), strict=True))
+        learned = self._loss.learned
+        sizes = [parameter.numel() for parameter in learned]
+        for parameter, part in zip(learned, vector.split(sizes), strict=True):
+            parameter.grad = part.view_as(parameter)
+        actors = sum(p.numel() for p in self._loss.actor.parameters() if p.grad is not None)
+        self._parts = vector.tensor_split([actors])
         return dict(zip(self._loss.tags, sums, strict=True))
+
+    def clip(self, max_norm: float) -> Tensor:
+        """Shorten the actor's and the critic's gradient to this length; return the lengths they had, shape (2,)."""
+        norms = torch.stack([part.norm() for part in self._parts])
+        for part, shorter in zip(self._parts, (max_norm / (norms + 1e-6)).clamp(max=1.0), strict=True):
+            part.mul_(shorter)
+        return norms
 
 
 class _Loss(Computation):
@@ -53,6 +67,7 @@ class _Loss(Computation):
         self.actor, self.critic = actor, critic
         self.terms: list[Term] = []
         self.tags: list[str] = []
+        self.learned: list[Tensor] = []
         self._mixed_precision = mixed_precision
 
     def forward(self, share: Share) -> tuple[Tensor, Tensor]:
@@ -67,13 +82,10 @@ class _Loss(Computation):
         return loss, torch.stack(list(log.entries.values()))
 
     def finish(self, result: tuple[Tensor, Tensor], parameters: Sequence[Tensor]) -> Outcome:
-        """Gradient of each parameter, or None, and what is logged."""
+        """Gradient of the parameters on which the loss depends, one after another, and what is logged."""
         loss, sums = result
-        learned = [parameter for parameter in parameters if parameter.requires_grad]
-        found = iter(torch.autograd.grad(loss, learned, allow_unused=True))
-        return [*(next(found) if parameter.requires_grad else None for parameter in parameters), sums]
-
-
-def _sum(parts: Sequence[Tensor | None]) -> Tensor | None:
-    """Over all shares, in their order; None if the share has none, as then no other has."""
-    return None if parts[0] is None else reduce(torch.add, (x for x in parts if x is not None))
+        asked = [i for i, parameter in enumerate(parameters) if parameter.requires_grad]
+        found = torch.autograd.grad(loss, [parameters[i] for i in asked], allow_unused=True)
+        own = list(self.parameters())
+        self.learned = [own[i] for i, gradient in zip(asked, found, strict=True) if gradient is not None]
+        return torch.cat([gradient.flatten() for gradient in found if gradient is not None]), sums

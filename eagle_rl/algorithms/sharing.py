@@ -22,8 +22,7 @@ from eagle_rl.threads import num_threads, share_out
 MIN_WORK = 2**25
 """Multiplications of a share, rows by parameters. To share out and gather takes .6 ms, in which a core does so many."""
 
-Outcome = list[Tensor | None]
-
+Outcome = Sequence[Tensor]
 
 @dataclass(frozen=True)
 class Share:
@@ -62,7 +61,7 @@ class Computation(nn.Module):
 
     def finish(self, result: Any, parameters: Sequence[Tensor]) -> Outcome:
         """Turn what ``forward`` returned into tensors, given the parameters it was computed with."""
-        return list(result)
+        return tuple(result)
 
     def compute(self, share: Share) -> Outcome:
         """What comes of a share."""
@@ -120,21 +119,17 @@ class Shared:
 def _make_kernel(computation: Computation, parameters: Sequence[Tensor], example: Share) -> Callable[[Share], Outcome]:
     """The kernel of a computation for shares like this one."""
     names, wanted = list(example.tensors), [parameter.requires_grad for parameter in parameters]
-    present: list[bool] = []
 
     def compute(*inputs: Tensor) -> list[Tensor]:
         at = [x.requires_grad_(want) for x, want in zip(inputs[: len(wanted)], wanted, strict=True)]
         share = replace(example, tensors=dict(zip(names, inputs[len(wanted) :], strict=True)))
-        outcome = computation.compute_at(at, share)
-        present[:] = [x is not None for x in outcome]
-        return [x for x in outcome if x is not None]
+        return list(computation.compute_at(at, share))
 
     inputs = [x.detach().clone() for x in (*parameters, *example.tensors.values())]
     kernel = kernels.compile_graph(kernels.record(compute, inputs), inputs, by_threads=True)
 
     def replay(share: Share) -> Outcome:
         with torch.no_grad():
-            found = iter(kernel(*(p.detach() for p in parameters), *(share[name] for name in names)))
-        return [next(found) if there else None for there in present]
+            return kernel(*(p.detach() for p in parameters), *(share[name] for name in names))
 
     return replay
