@@ -15,6 +15,7 @@ from eagle_rl.evaluation.evaluate import evaluate
 from eagle_rl.machine import own_cores
 from eagle_rl.models.precision import set_up_torch
 from eagle_rl.runners.checkpoint import latest_checkpoint
+from eagle_rl.runners.compiling import compile_where_it_pays
 from eagle_rl.runners.on_policy import EagleRunner, make_train_cfg
 from eagle_rl.runners.provenance import Provenance
 
@@ -78,6 +79,7 @@ def _runner(cfg: ExperimentCfg, folder: Path) -> EagleRunner:
     history = cfg.task.observations.history_length
     train_cfg = make_train_cfg(cfg.algo, cfg.run, history_length=history, seed=cfg.seed)
     runner = EagleRunner(env, train_cfg, folder, cfg.run.device, Provenance(config=asdict(cfg), stage="quality"))
+    compile_where_it_pays(env, runner.alg, cfg.run, cfg.plan.generalist_env_steps)
     latest = latest_checkpoint(folder / "checkpoints")
     if latest is not None:
         runner.load(latest)
