@@ -14,8 +14,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from eagle_rl.algorithms.eagle_ppo import EaglePPO
 from eagle_rl.machine import own_cores
-from eagle_rl.threads import use_threads
 from eagle_rl.runners.on_policy import EagleRunner
+from eagle_rl.threads import use_threads
 
 from .budget import Budget
 from .measure import Cost, Figure, in_turns, milliseconds

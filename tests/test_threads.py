@@ -110,4 +110,9 @@ def test_torch_itself_computes_with_one_thread_however_many_learn():
     assert torch.get_num_threads() == 1
     assert num_threads() == 3
     met = threading.Barrier(3, timeout=30)
-    assert share_out(lambda _: met.wait() and torch.get_num_threads() or torch.get_num_threads(), [0, 1, 2]) == [1] * 3
+
+    def count(_: int) -> int:
+        met.wait()
+        return torch.get_num_threads()
+
+    assert share_out(count, [0, 1, 2]) == [1, 1, 1]

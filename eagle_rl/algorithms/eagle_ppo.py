@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Mapping
 from typing import Any, Literal
 
@@ -157,29 +157,33 @@ class EaglePPO(PPO):
         return told | {KL: kl} | {tag: float(count) for tag, count in counts.items()}
 
     def _learn(self) -> tuple[dict[str, float], list[float]]:
-        """Take a step for each minibatch of each epoch; return means by tag and the KL of each minibatch."""
-        cfg, sums, kls = self.cfg, Counter[str](), []
-        num_shares = self.gradient.num_shares(self.storage.actions[..., 0].numel() // cfg.num_mini_batches)
-        now = torch.tensor(float(self.num_updates), device=self.device)
-        for shares in self.storage.minibatches(
-            cfg.num_mini_batches, cfg.num_learning_epochs, num_shares, num_updates=now
-        ):
+        """Take a step for each minibatch of each epoch; return mean losses by tag and the KL of each minibatch."""
+        cfg, kls = self.cfg, []
+        sums: defaultdict[str, Tensor] = defaultdict(lambda: torch.zeros(2, device=self.device))
+        rows = self.storage.num_envs * self.storage.num_transitions_per_env // cfg.num_mini_batches
+        batches = self.storage.minibatches(
+            cfg.num_mini_batches,
+            cfg.num_learning_epochs,
+            self.gradient.num_shares(rows),
+            num_updates=torch.tensor(float(self.num_updates), device=self.device),
+        )
+        for shares in batches:
             told = self.gradient(shares)
             self.stopwatch.lap("gradient")
             total, weight = told[KL]
             kls.append(self._mean_over_processes(total / weight))
             self._step(kls[-1])
-            self.stopwatch.lap("optimiser")
             for tag, entry in told.items():
-                sums[tag] = sums[tag] + entry
-        means = {tag: total / weight for tag, (total, weight) in ((tag, x.tolist()) for tag, x in sums.items()) if weight}
-        return means, kls
+                sums[tag] += entry
+            self.stopwatch.lap("optimiser")
+        entries = {tag: entry.tolist() for tag, entry in sums.items()}
+        return {tag: total / weight for tag, (total, weight) in entries.items() if weight > 0}, kls
 
     def _step(self, kl: float) -> None:
         """Step along the gradient averaged over processes, unless that does harm.
 
-        It does where the gradient is not finite, and where the policy has already left the region PPO's loss is good for:
-        one more step may wreck it.
+        It does where the gradient is not finite, and where the policy has already left the region PPO's loss is good
+        for: one more step may wreck it.
         """
         if self.gpu_world_size > 1:
             self.reduce_parameters()

@@ -26,10 +26,10 @@ class Rollout(RolloutStorage):
             common: scalars that every share gets by name.
 
         Yields:
-            Shares of a minibatch: each has every ``num_shares``-th row, so that leading rows are shared out alike. Their
-            tensors are the observation groups, (n, ...); ``actions``, ``old_mean``, ``old_std``, (n, 32); ``values``,
-            ``returns``, ``advantages``, ``old_log_prob``, (n,); and ``live``, the mean number of live slots of a row of
-            the minibatch, a scalar.
+            Shares of a minibatch: each has every ``num_shares``-th row, so that leading rows are shared out alike.
+            Their tensors are the observation groups, (n, ...); ``actions``, ``old_mean``, ``old_std``, (n, 32);
+            ``values``, ``returns``, ``advantages``, ``old_log_prob``, (n,); and ``live``, the mean number of live slots
+            of a row of the minibatch, a scalar.
         """
         size = self.num_envs * self.num_transitions_per_env // num_mini_batches
         order = torch.randperm(num_mini_batches * size, device=self.device)

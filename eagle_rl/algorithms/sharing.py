@@ -24,6 +24,7 @@ MIN_WORK = 2**25
 
 Outcome = Sequence[Tensor]
 
+
 @dataclass(frozen=True)
 class Share:
     """Rows that one thread computes: tensors by name, (n, ...), and scalars that all shares have in common."""

@@ -35,7 +35,8 @@ class Policy:
     @classmethod
     def of(cls, actor: EagleActor, share: Share) -> Policy:
         """One forward pass, which leaves no trace in the actor: other threads make theirs."""
-        mean, embedding, estimate = actor.outputs(*(share[group] for group in ACTOR_INPUTS))
+        history, command, clock = (share[group] for group in ACTOR_INPUTS)
+        mean, embedding, estimate = actor.outputs(history, command, clock)
         gaussian = actor.distribution
         return cls(mean * share["slot_mask"], gaussian.std_param.clamp(*gaussian.std_range), embedding, estimate)
 

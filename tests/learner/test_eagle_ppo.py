@@ -168,6 +168,18 @@ def test_the_learning_rate_follows_the_kl_of_the_last_epoch():
     assert runner.alg.update()["Loss/kl"] > 0.0, "the KL of the first epoch, before any step, is zero"
 
 
+def test_gradients_of_actor_and_critic_are_shortened_each_by_its_own_length():
+    lengths = {}
+    for bound in (1e9, 0.05):
+        runner = make_runner(**ONE_STEP, max_grad_norm=bound, value_loss_coef=1e-4)
+        collect(runner)
+        runner.alg.update()
+        models = (runner.alg.actor, runner.alg.critic)
+        lengths[bound] = [torch.cat([p.grad.flatten() for p in m.parameters()]).norm().item() for m in models]
+    assert lengths[1e9][0] > 0.05 > lengths[1e9][1], f"one is to be shortened and one is not: {lengths[1e9]}"
+    assert lengths[0.05] == pytest.approx([0.05, lengths[1e9][1]], rel=1e-3)
+
+
 def test_the_critic_s_learning_rate_is_its_own():
     runner = make_runner(critic_learning_rate=3e-4, desired_kl=1e-6)
     collect(runner)

@@ -45,9 +45,11 @@ PPO = "eagle_rl/algorithms/eagle_ppo.py"
 ENV = "envs/humanoid_env.py"
 CONTROL_STEP = "envs/control_step.py"
 RECORDING = "envs/recording.py"
-AUXILIARY = "eagle_rl/algorithms/auxiliary.py"
+TERMS = "eagle_rl/algorithms/terms.py"
 ACTOR = "eagle_rl/models/actor.py"
-SHARES = "eagle_rl/models/shares.py"
+SHARING = "eagle_rl/algorithms/sharing.py"
+GRADIENT = "eagle_rl/algorithms/gradient.py"
+THREADS = "eagle_rl/threads.py"
 
 REWARD_TESTS = "mdp/test_rewards.py"
 LEARNER_TESTS = "learner/test_eagle_ppo.py"
@@ -166,37 +168,32 @@ MUTANTS: tuple[Mutant, ...] = (
         "evaluation/test_evaluate.py",
     ),
     # learner
-    Mutant(LOSSES, "* mask).sum() / mask.sum()", "* mask).mean()", "learner/test_losses.py"),
+    Mutant(LOSSES, "* mask).sum(dim=1) / live", "* mask).mean(dim=1)", "learner/test_losses.py"),
     Mutant(LOSSES, "mean_of_mirrored[:, perm] * sign", "mean_of_mirrored[:, perm]", "learner/test_losses.py"),
     Mutant(LOSSES, "(teacher_std / std).square()", "(std / teacher_std).square()", "learner/test_losses.py"),
     Mutant(
         LOSSES,
-        "error[:, BASE_VELOCITY_DIM:].mean()",
-        "error[:, BASE_VELOCITY_DIM + 1 :].mean()",
+        "error[:, BASE_VELOCITY_DIM:].mean(dim=1)",
+        "error[:, BASE_VELOCITY_DIM + 1 :].mean(dim=1)",
         "learner/test_losses.py",
     ),
     Mutant(
         GAUSSIAN,
-        "(self._distribution.log_prob(outputs) * self.mask)",
-        "(self._distribution.log_prob(outputs))",
+        "- std.log() - _LOG_SQRT_2_PI) * mask)",
+        "- std.log() - _LOG_SQRT_2_PI))",
         "learner/test_distribution.py",
     ),
-    Mutant(
-        GAUSSIAN,
-        "(self._distribution.entropy() * self.mask)",
-        "(self._distribution.entropy())",
-        "learner/test_distribution.py",
-    ),
-    Mutant(GAUSSIAN, "kl_divergence(old, new).sum", "kl_divergence(new, old).sum", "learner/test_distribution.py"),
+    Mutant(GAUSSIAN, "0.5 + _LOG_SQRT_2_PI) * mask)", "_LOG_SQRT_2_PI) * mask)", "learner/test_distribution.py"),
+    Mutant(GAUSSIAN, "(old_std / std).square()", "(std / old_std).square()", "learner/test_distribution.py"),
     Mutant(PPO, "self.gamma * final", "final", LEARNER_TESTS),
     Mutant(PPO, "dones = dones.index_fill(0, ids, 1)", "dones = dones.clone()", LEARNER_TESTS),
     Mutant(ENV, "time_outs | (self._about_to_be_surprised() & ~dones)", "time_outs", "envs/test_humanoid_env.py"),
     Mutant(
         PPO, "self.learning_rate / LEARNING_RATE_FACTOR", "self.learning_rate * LEARNING_RATE_FACTOR", LEARNER_TESTS
     ),
-    Mutant(PPO, "math.exp(-cfg.kickstart_decay", "math.exp(cfg.kickstart_decay", LEARNER_TESTS),
+    Mutant(TERMS, "torch.exp(-self.decay", "torch.exp(self.decay", LEARNER_TESTS),
     Mutant(
-        AUXILIARY,
+        TERMS,
         "self.alpha * action + self.beta * embedding",
         "self.beta * action + self.alpha * embedding",
         LEARNER_TESTS,
@@ -275,16 +272,13 @@ MUTANTS: tuple[Mutant, ...] = (
     ),
     Mutant(TRIALS, "t >= self._cfg.settling_steps", "t > self._cfg.settling_steps", "evaluation/test_trials.py"),
     Mutant(PPO, "(last / first) ** min", "(first / last) ** min", LEARNER_TESTS),
-    Mutant(SHARES, "reduce(torch.add, same)", "same[0]", "learner/test_shares.py"),
-    Mutant(
-        SHARES,
-        "own[i] if i in own else future.result()",
-        "own[i] if i in own else own[max(own)]",
-        "learner/test_shares.py",
-    ),
-    Mutant(
-        SHARES, 'torch.autocast("cpu", dtype, mixed,', 'torch.autocast("cpu", dtype, False,', "learner/test_shares.py"
-    ),
+    Mutant(LOSSES, "return -torch.min(ratio", "return -torch.max(ratio", "learner/test_losses.py"),
+    Mutant(GRADIENT, "(reduce(torch.add, same) for", "(same[0] for", "learner/test_sharing.py"),
+    Mutant(GRADIENT, "(max_norm / (norms + 1e-6))", "(max_norm / (norms.sum() + 1e-6))", LEARNER_TESTS),
+    Mutant(TERMS, "self.coef * rows.sum() / everyone", "self.coef * rows.sum() / own", "learner/test_sharing.py"),
+    Mutant(SHARING, "range(self.index, rows, self.count)", "range(0, rows, self.count)", "learner/test_rollout.py"),
+    Mutant(SHARING, "*(p.detach() for p in parameters)", "*inputs[: len(wanted)]", "learner/test_sharing.py"),
+    Mutant(THREADS, "own[i] if i in own else future", "own[max(own)] if own else future", "test_threads.py"),
     Mutant(CONTROL_STEP, '"_noise_keys", ', "", "envs/test_recording.py"),
     Mutant(CONTROL_STEP, 'writes, *written), ("_state",)', "writes, *written), ()", "envs/test_recording.py"),
     Mutant(
