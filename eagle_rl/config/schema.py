@@ -245,14 +245,14 @@ class RunCfg:
     num_threads: int = 0
     """Physics threads; 0 takes every core, under torchrun its process's share of them."""
     torch_threads: int = 0
-    """Threads of the learner on a CPU, among which rows of its networks' inputs are shared out; 0 takes every core,
-    under torchrun or ``--jobs`` the process's share of them. They sleep while they wait, so that on a busy machine
-    they are hardly slower than one. Results depend in the last digits on their number, and so with 0 on the machine;
-    never on what else runs."""
+    """Threads of the learner on a CPU, among which the rows of each minibatch are shared out; 0 takes every core, under
+    torchrun or ``--jobs`` the process's share of them. They sleep while they wait, so that on a busy machine they are
+    hardly slower than one. Results depend in the last digits on their number, and so with 0 on the machine; never on
+    what else runs."""
     compile: Literal["auto", "always", "never"] = "auto"
-    """Whether training takes the environments' steps by kernels compiled from their code, equal up to rounding.
-    ``auto`` does on a CPU, in stages of five million steps and more, from control step 1000 on: compiling takes half a
-    minute, the next time a few seconds. ``always`` does from the first step on (docs/performance.md)."""
+    """Whether training takes the environments' steps, acts and learns by kernels compiled from the code, equal up to
+    rounding. ``auto`` does on a CPU, in stages of five million steps and more, from control step 1000 on: compiling
+    takes about a minute, the next time some seconds. ``always`` does from the first step on (docs/performance.md)."""
     save_interval: int = 50
     """Iterations between checkpoints."""
     keep_checkpoints: int = 3
