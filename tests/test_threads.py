@@ -23,6 +23,20 @@ def test_results_come_in_the_order_of_the_tasks(threads, tasks):
     assert share_out(lambda x: (x, x + 1), tasks) == [(x, x + 1) for x in tasks]
 
 
+def test_results_come_in_the_order_of_the_tasks_whichever_is_done_first():
+    second_is_done = threading.Event()
+
+    def first_last(task: int) -> int:
+        if task == 0:
+            assert second_is_done.wait(30)
+        elif task == 1:
+            second_is_done.set()
+        return task
+
+    use_threads(2)
+    assert share_out(first_last, [0, 1, 2]) == [0, 1, 2]
+
+
 def test_a_helper_does_one_of_two_tasks_and_the_caller_the_other():
     met = threading.Barrier(2, timeout=30)  # neither goes on before the other has begun
 

@@ -278,7 +278,7 @@ MUTANTS: tuple[Mutant, ...] = (
     Mutant(TERMS, "self.coef * rows.sum() / everyone", "self.coef * rows.sum() / own", "learner/test_sharing.py"),
     Mutant(SHARING, "range(self.index, rows, self.count)", "range(0, rows, self.count)", "learner/test_rollout.py"),
     Mutant(SHARING, "*(p.detach() for p in parameters)", "*inputs[: len(wanted)]", "learner/test_sharing.py"),
-    Mutant(THREADS, "own[i] if i in own else future", "own[max(own)] if own else future", "test_threads.py"),
+    Mutant(THREADS, "results[i] for i in range(len(tasks))", "results[i] for i in results", "test_threads.py"),
     Mutant(CONTROL_STEP, '"_noise_keys", ', "", "envs/test_recording.py"),
     Mutant(CONTROL_STEP, 'writes, *written), ("_state",)', "writes, *written), ()", "envs/test_recording.py"),
     Mutant(
