@@ -72,7 +72,7 @@ class EaglePPO(PPO):
         self.imitation_updates = math.inf
         """Updates over which imitation without PPO lowers its learning rate; for ever, unless told."""
         self.compile_from = math.inf
-        """Update from which on gradients and actions are computed by compiled kernels, equal up to rounding."""
+        """Number of updates after which actions and gradients are computed by compiled kernels, equal up to rounding."""
         self.skipped_steps = 0
         self._skipped_in_a_row = 0
         self._withheld_steps = 0
@@ -116,6 +116,9 @@ class EaglePPO(PPO):
 
     def act(self, obs: TensorDict) -> Tensor:
         """Sample actions, shape (N, 32), and keep what the update wants to know of them."""
+        if self.num_updates >= self.compile_from:  # here, since a resumed run begins by acting
+            self.acting.compile()
+            self.gradient.compile()
         decision, step = self.acting(obs), self.transition
         step.hidden_states, step.observations = (None, None), obs
         step.actions, step.values, step.actions_log_prob = decision.actions, decision.value, decision.log_prob
@@ -141,9 +144,6 @@ class EaglePPO(PPO):
         """Label the rollout, optimise the sum of all losses, adapt the learning rate; return scalars by tag."""
         if self.specialists is not None:
             self.storage.observations.update(self.specialists.label(self.storage.observations))
-        if self.num_updates >= self.compile_from:
-            self.gradient.compile()
-            self.acting.compile()
         told, kls = self._learn()
         self.storage.clear()
         self.num_updates += 1
