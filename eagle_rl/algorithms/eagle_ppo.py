@@ -72,7 +72,7 @@ class EaglePPO(PPO):
         self.imitation_updates = math.inf
         """Updates over which imitation without PPO lowers its learning rate; for ever, unless told."""
         self.compile_from = math.inf
-        """Number of updates after which actions and gradients are computed by compiled kernels, equal up to rounding."""
+        """Updates after which actions and gradients are computed by compiled kernels, equal up to rounding."""
         self.skipped_steps = 0
         self._skipped_in_a_row = 0
         self._withheld_steps = 0
