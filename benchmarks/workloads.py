@@ -15,6 +15,7 @@ from eagle_rl.models.precision import set_up_torch
 from eagle_rl.runners.on_policy import EagleRunner, make_train_cfg
 from envs.humanoid_env import HumanoidEnv
 from envs.robots.spec import Array
+from envs.sim.batch import RobotBatch
 
 from .measure import Cost, in_turns
 
@@ -66,7 +67,7 @@ class BarePhysics:
 
     def __init__(self, env: HumanoidEnv) -> None:
         """Take the simulations of ``env``."""
-        self._batches = env.pool.batches
+        self._batches, self._workers = env.pool.batches, env.pool.workers
         self._starts: list[list[tuple[Array, Array]]] = []
         self._present: list[Array] | None = None
 
@@ -88,8 +89,7 @@ class BarePhysics:
 
     def step(self) -> None:
         """As many physics steps as one control step has."""
-        for batch in self._batches:
-            batch.advance()
+        self._workers.do(RobotBatch.advance, self._batches)
 
     def return_to_present(self) -> None:
         """Undo what was rewound."""
