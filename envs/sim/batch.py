@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -53,21 +52,21 @@ class RobotBatch:
         self._base = int(model.jnt_bodyid[0])
         self.actuator_force: Array = self._batch.bind("actuator_force")
         self.sensordata: Array = self._batch.bind("sensordata")
-        written: dict[str, NDArray[Any]] = {
-            "status": self._batch.status[:, None],
-            "warning": self._batch.warning[:, :, 1],
-            "sensordata": self.sensordata,
-            "time": self._time[:, None],
-            "qpos": self.qpos,
-            "qvel": self.qvel,
-            "ctrl": self.ctrl,
-            "actuator_force": self.actuator_force,
-        }
-        self.columns = consecutive({name: values.shape[1] for name, values in written.items()})
-        """Where everything lies in a row of :meth:`read`; up to ``qpos`` in the same place for every robot."""
-        self.width = self.columns["actuator_force"].stop
+        sizes = {"status": 1, "warning": self._batch.warning.shape[1], "sensordata": model.nsensordata, "time": 1}
+        sizes |= {"qpos": model.nq, "qvel": model.nv, "ctrl": model.nu, "actuator_force": model.nu}
+        self.columns = consecutive(sizes)
+        """Where everything lies in a row of :meth:`read`; up to ``qpos`` it is the same for every robot."""
+        self.width = sum(sizes.values())
         """Of such a row."""
-        self._written = [(self.columns[name], values) for name, values in written.items()]
+        motion = slice(self.columns["time"].start, self.columns["qvel"].stop)
+        self._written = (
+            (self.columns["status"], self._batch.status[:, None]),
+            (self.columns["warning"], self._batch.warning[:, :, 1]),
+            (self.columns["sensordata"], self.sensordata),
+            (motion, self._batch.state[:, : 1 + model.nq + model.nv]),  # a state begins with time, qpos and qvel
+            (self.columns["ctrl"], self.ctrl),
+            (self.columns["actuator_force"], self.actuator_force),
+        )
         self._batch.reset(keyframe=0)
 
     def step(self, targets: Array, aimed: NDArray[np.bool_] | bool = True) -> None:

@@ -199,8 +199,9 @@ class PhysicsPool:
         alarms = after[:, columns["status"].start : columns["warning"].stop]
         advanced = after[:, columns["time"].start] > before[:, columns["time"].start]
         self._causes = diagnose(rows, advanced, np.logical_or.reduce(alarms, axis=1), wild)
-        sick = np.flatnonzero(self._causes)
-        rows[sick] = self._array[sick]
+        if self._causes.any():
+            sick = self._causes > 0
+            rows[sick] = self._array[sick]
         self._array[:] = rows
 
     def _keep_faults(self, folder: Path) -> None:

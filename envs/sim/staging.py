@@ -60,9 +60,10 @@ class Staging:
         The torque is that of the last physics step: clipped kp * error minus kd * velocity [N m].
         """
         rows: Array = native.take(self._source[envs])
-        rows[:, self.columns["joint_pos"]] -= self._zero_offsets[envs]
-        rows[:, self.columns["joint_torque"]] -= self.damping[envs] * rows[:, self.columns["joint_vel"]]
-        rows[:, self._joints] *= self._signs[envs]
+        with np.errstate(over="ignore", invalid="ignore"):  # in rows of the sick, which are left out later
+            rows[:, self.columns["joint_pos"]] -= self._zero_offsets[envs]
+            rows[:, self.columns["joint_torque"]] -= self.damping[envs] * rows[:, self.columns["joint_vel"]]
+            rows[:, self._joints] *= self._signs[envs]
         return rows
 
     def _source_columns(self, batch: RobotBatch) -> NDArray[np.int64]:

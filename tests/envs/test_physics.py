@@ -90,6 +90,7 @@ def test_the_pool_gathers_canonical_angles_into_slots() -> None:
         staged = pool.step(pooled)
     for batch, rows in zip(pool.batches, pool.rows, strict=True):
         spec, block = batch.spec, staged[rows].numpy()
+        assert np.array_equal(batch.ctrl, spec.to_native(pooled[rows].numpy())), "targets"
         assert np.array_equal(block[:, pool.columns["root_pos"]], batch.qpos[:, :3])
         assert np.array_equal(block[:, pool.columns["sensors"]], batch.sensordata)
         joint_pos = block[:, pool.columns["joint_pos"]]
@@ -114,6 +115,20 @@ def test_threads_side_by_side_give_the_same_bits_as_one(threads: int) -> None:
         assert torch.equal(one, other), f"step {step}"
         assert torch.equal(*(pool.causes() for pool in pools))
         assert bool(pools[0].causes()[8]) == (step == 5)
+
+
+def test_the_torque_is_that_of_the_gains_in_force() -> None:
+    pool = make_pool("h1", "t1")
+    scales = 1.0 + torch.rand(2, 2, 32, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    pool.scale_gains(torch.tensor([1, 2]), *scales)
+    staged = pool.step(torch.zeros(4, 32, dtype=torch.float64))[:, pool.columns["joint_torque"]]
+    scales = torch.cat((torch.ones(2, 1, 32), scales, torch.ones(2, 1, 32)), dim=1).numpy()
+    for batch, rows in zip(pool.batches, pool.rows, strict=True):
+        spec = batch.spec
+        kp, kd = scales[:, rows][..., spec.slots] * np.stack((spec.stiffness, spec.damping))[:, None]
+        assert np.array_equal(batch._batch.expand("actuator_gainprm")[:, :, 0], kp)
+        torque = batch.actuator_force - kd * batch.qvel[:, 6:]
+        assert np.allclose(staged[rows].numpy(), spec.to_slots(spec.signs * torque))
 
 
 def test_pool_rows_are_split_by_batch() -> None:
