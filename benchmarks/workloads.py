@@ -58,7 +58,7 @@ class Stepping:
 
 
 class BarePhysics:
-    """The physics of an environment without anything around it: native threads over the same simulations.
+    """The physics of an environment without anything around it: its threads over the same simulations.
 
     It takes the control steps that the environment took once more, from the same states under the same targets; under
     targets that stay as they are robots come to rest, and physics is up to a tenth quicker. MuJoCo's batch is as fast
