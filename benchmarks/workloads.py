@@ -15,6 +15,7 @@ from eagle_rl.models.precision import set_up_torch
 from eagle_rl.runners.on_policy import EagleRunner, make_train_cfg
 from envs.humanoid_env import HumanoidEnv
 from envs.robots.spec import Array
+from envs.sim.batch import RobotBatch
 
 from .measure import Cost, in_turns
 
@@ -57,7 +58,7 @@ class Stepping:
 
 
 class BarePhysics:
-    """The physics of an environment without anything around it: native threads over the same simulations.
+    """The physics of an environment without anything around it: its threads over the same simulations.
 
     It takes the control steps that the environment took once more, from the same states under the same targets; under
     targets that stay as they are robots come to rest, and physics is up to a tenth quicker. MuJoCo's batch is as fast
@@ -66,7 +67,7 @@ class BarePhysics:
 
     def __init__(self, env: HumanoidEnv) -> None:
         """Take the simulations of ``env``."""
-        self._batches = env.pool.batches
+        self._batches, self._threads = env.pool.batches, env.pool.threads
         self._starts: list[list[tuple[Array, Array]]] = []
         self._present: list[Array] | None = None
 
@@ -88,8 +89,7 @@ class BarePhysics:
 
     def step(self) -> None:
         """As many physics steps as one control step has."""
-        for batch in self._batches:
-            batch.advance()
+        self._threads.share_out(RobotBatch.advance, self._batches)
 
     def return_to_present(self) -> None:
         """Undo what was rewound."""

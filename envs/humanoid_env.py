@@ -38,7 +38,6 @@ from .robots.embodiment import pooled_embodiment
 from .robots.model import build_model
 from .robots.slots import NUM_SLOTS
 from .robots.spec import RobotSpec
-from .sim.batch import RobotBatch
 from .sim.pool import PhysicsPool
 from .sim.terrain import Terrain, build_terrain
 from .step_log import StepLog, episode_ratio
@@ -90,11 +89,10 @@ class HumanoidEnv(ControlStep, VecEnv):
         self.robot_names = [spec.name for spec in robots]
         counts, terrain = share(num_envs, len(robots)), build_terrain(task.terrain, seed)
         field = terrain.field if terrain is not None else None
-        batches = [
-            RobotBatch(spec, build_model(spec, task.sim, field), count, task.sim.decimation, num_threads)
-            for spec, count in zip(robots, counts, strict=True)
+        simulated = [
+            (spec, build_model(spec, task.sim, field), count) for spec, count in zip(robots, counts, strict=True)
         ]
-        self.pool = PhysicsPool(batches, self.device, dtype, overlap=num_threads != 1)
+        self.pool = PhysicsPool(simulated, task.sim.decimation, self.device, dtype, num_threads)
         self.rng = CounterRng(
             seed,
             [name for name, count in zip(self.robot_names, counts, strict=True) for _ in range(count)],

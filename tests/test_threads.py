@@ -23,6 +23,21 @@ def test_results_come_in_the_order_of_the_tasks(threads, tasks):
     assert share_out(lambda x: (x, x + 1), tasks) == [(x, x + 1) for x in tasks]
 
 
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_every_task_is_done_once_in_at_most_so_many_threads(count):
+    done, where = [], set()
+
+    def do(task: int) -> None:
+        done.append(task)
+        where.add(threading.get_ident())
+
+    use_threads(count)
+    for _ in range(50):
+        share_out(do, range(7))
+    assert sorted(done) == sorted([*range(7)] * 50)
+    assert len(where) <= count
+
+
 def test_results_come_in_the_order_of_the_tasks_whichever_is_done_first():
     second_is_done = threading.Event()
 

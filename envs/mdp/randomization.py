@@ -123,11 +123,5 @@ class Randomizer:
 
     def _apply(self, ids: Tensor) -> None:
         """Write friction and gains of some environments into the physics."""
-        friction, kp, kd = (
-            x[ids].to("cpu", torch.float64).numpy() for x in (self.friction, self._stiffness_scale, self._damping_scale)
-        )
-        for robot, local, at in self._pool.split(ids):
-            batch = self._pool.batches[robot]
-            spec = batch.spec
-            batch.set_friction(local, friction[at])
-            batch.set_gains(local, spec.stiffness * kp[at][:, spec.slots], spec.damping * kd[at][:, spec.slots])
+        self._pool.set_friction(ids, self.friction[ids])
+        self._pool.scale_gains(ids, self._stiffness_scale[ids], self._damping_scale[ids])

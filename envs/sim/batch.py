@@ -1,6 +1,8 @@
-"""All environments of one robot, stepped by MuJoCo's native threads; no Python runs between physics steps."""
+"""Simulations of one robot that a thread steps as one; no Python runs between physics steps."""
 
 from __future__ import annotations
+
+import contextlib
 
 import mujoco
 import numpy as np
@@ -8,8 +10,8 @@ from mujoco.batch import Batch, SimulationError
 from numpy.typing import NDArray
 
 from ..robots.spec import Array, RobotSpec
+from .columns import consecutive
 from .fault import Fault
-from .health import CAUSES, FlightRecorder, diagnose
 
 _VEL = mujoco.mjtStage.mjSTAGE_VEL.value
 _ACC = mujoco.mjtStage.mjSTAGE_ACC.value
@@ -24,7 +26,7 @@ class RobotBatch:
     """
 
     def __init__(
-        self, spec: RobotSpec, model: mujoco.MjModel, num_envs: int, decimation: int, num_threads: int
+        self, spec: RobotSpec, model: mujoco.MjModel, num_envs: int, decimation: int, first_env: int = 0
     ) -> None:
         """Create the simulations, all in the model's default keyframe.
 
@@ -33,54 +35,59 @@ class RobotBatch:
             model: its compiled model, see ``envs.robots.model.build_model``.
             num_envs: number of simulations.
             decimation: physics steps per control step.
-            num_threads: threads, 0 for one per core.
+            first_env: number of the first simulation among the robot's environments.
         """
         self.spec = spec
         self.model = model
         self.num_envs = num_envs
+        self.first_env = first_env
         self._decimation = decimation
-        self._batch = Batch(model, num_envs, num_threads)
+        self._batch = Batch(model, num_envs, nthread=1)
         self.qpos: Array = self._batch.bind("qpos")
         self.qvel: Array = self._batch.bind("qvel")
         self.ctrl: Array = self._batch.bind("ctrl")
         self._time: Array = self._batch.bind("time")
         self._warmstart: Array = self._batch.bind("qacc_warmstart")
         self._xfrc: Array = self._batch.bind("xfrc_applied")
-        self._actuator_force: Array = self._batch.bind("actuator_force")
-        self.sensordata: Array = self._batch.bind("sensordata")
         self._base = int(model.jnt_bodyid[0])
-        self._kd: Array = np.broadcast_to(spec.damping, (num_envs, spec.num_joints))
-        self._last_time: Array = np.zeros(num_envs)
-        self._recorder = FlightRecorder(num_envs, self._batch.nstate)
-        self.causes: NDArray[np.int64] = np.zeros(num_envs, dtype=np.int64)
-        """What went wrong with each simulation in the last step, 0 for nothing, shape (n,); see ``CAUSES``."""
+        self.actuator_force: Array = self._batch.bind("actuator_force")
+        self.sensordata: Array = self._batch.bind("sensordata")
+        sizes = {"status": 1, "warning": self._batch.warning.shape[1], "sensordata": model.nsensordata, "time": 1}
+        sizes |= {"qpos": model.nq, "qvel": model.nv, "ctrl": model.nu, "actuator_force": model.nu}
+        self.columns = consecutive(sizes)
+        """Where everything lies in a row of :meth:`read`; up to ``qpos`` it is the same for every robot."""
+        self.width = sum(sizes.values())
+        """Of such a row."""
+        motion = slice(self.columns["time"].start, self.columns["qvel"].stop)
+        self._written = (
+            (self.columns["status"], self._batch.status[:, None]),
+            (self.columns["warning"], self._batch.warning[:, :, 1]),
+            (self.columns["sensordata"], self.sensordata),
+            (motion, self._batch.state[:, : 1 + model.nq + model.nv]),  # a state begins with time, qpos and qvel
+            (self.columns["ctrl"], self.ctrl),
+            (self.columns["actuator_force"], self.actuator_force),
+        )
         self._batch.reset(keyframe=0)
 
-    @property
-    def joint_torque(self) -> Array:
-        """Torque of the last physics step: clipped kp * error minus kd * velocity [N m], shape (n, joints)."""
-        return self._actuator_force - self._kd * self.qvel[:, 6:]
+    def step(self, targets: Array, aimed: NDArray[np.bool_] | bool = True) -> None:
+        """Advance every simulation by one control step.
 
-    def step(self, targets: Array) -> None:
-        """Advance every simulation by one control step towards PD targets [rad], shape (n, joints).
-
-        A simulation with a target that is not finite keeps the targets it had, and is reported in ``causes``.
+        Args:
+            targets: PD targets [rad], shape (n, joints).
+            aimed: whether a simulation takes them or keeps those it has, shape (n, 1).
         """
-        wild = ~np.isfinite(targets.sum(axis=1))
-        np.copyto(self.ctrl, targets, where=~wild[:, None])
-        warned = self.advance()
-        self._recorder.add(self._batch.state)
-        self.causes = diagnose(self.qpos, self.qvel, self._time > self._last_time, warned, wild)
-        self._last_time[:] = self._time
+        np.copyto(self.ctrl, targets, where=aimed)
+        self.advance()
 
-    def advance(self) -> NDArray[np.bool_]:
-        """Nothing but physics; returns the simulations that MuJoCo warned about or refused to step, shape (n,)."""
-        refused = np.zeros(self.num_envs, dtype=np.bool_)
-        try:
+    def advance(self) -> None:
+        """Nothing but physics. A simulation that MuJoCo refuses to step has a status of its own."""
+        with contextlib.suppress(SimulationError):
             self._batch.step(nstep=self._decimation, stage=_VEL)
-        except SimulationError as error:
-            refused[error.ids] = True
-        return refused | self._batch.warning[:, :, 1].any(axis=1)
+
+    def read(self, out: Array, ids: Ids | slice = slice(None)) -> None:
+        """Copy what MuJoCo wrote of some simulations into their rows of ``out``, shape (n, ``width`` or more)."""
+        for columns, values in self._written:
+            out[ids, columns] = values[ids]
 
     def refresh(self, ids: Ids) -> None:
         """Recompute every derived quantity of some simulations from their state, after it was written."""
@@ -94,8 +101,6 @@ class RobotBatch:
         self._time[ids] = 0.0
         self._warmstart[ids] = 0.0
         self._xfrc[ids] = 0.0
-        self._last_time[ids] = 0.0
-        self._recorder.forget(ids)
         self._batch.warning[ids] = 0
         self.refresh(ids)
 
@@ -125,7 +130,6 @@ class RobotBatch:
         self._batch.expand("actuator_gainprm")[ids, :, 0] = stiffness
         self._batch.expand("actuator_biasprm")[ids, :, 1] = -stiffness
         self._batch.expand("dof_damping")[ids, 6:] = damping
-        self._kd = self._batch.expand("dof_damping")[:, 6:]
 
     def change_bodies(self, length_scale: Array, mass_scale: Array, added_mass: Array, com_offset: Array) -> None:
         """Change every simulation's bodies once, then recompute the constants MuJoCo derives from them.
@@ -153,25 +157,18 @@ class RobotBatch:
             nominal = getattr(model, name)[bodies > 0]
             self._batch.expand(name)[:, bodies > 0] = np.multiply.outer(scale, nominal)
 
-    def fault(self, env: int) -> Fault:
-        """The last states of a simulation that ``causes`` names."""
-        states = self._recorder.last(env)
+    def fault(self, env: int, cause: str, rows: Array) -> Fault:
+        """What a simulation did before it fell ill, from rows of its last steps, see ``columns``, shape (k, width)."""
         return Fault(
             robot=self.spec.name,
             robot_file=str(self.spec.yaml_path),
-            cause=CAUSES[self.causes[env] - 1],
-            env=env,
-            time=states[:, 0],
-            qpos=states[:, self._state_columns(mujoco.mjtState.mjSTATE_QPOS)],
-            qvel=states[:, self._state_columns(mujoco.mjtState.mjSTATE_QVEL)],
-            ctrl=states[:, self._state_columns(mujoco.mjtState.mjSTATE_CTRL)],
+            cause=cause,
+            env=self.first_env + env,
+            time=rows[:, self.columns["time"].start],
+            qpos=rows[:, self.columns["qpos"]],
+            qvel=rows[:, self.columns["qvel"]],
+            ctrl=rows[:, self.columns["ctrl"]],
         )
-
-    def _state_columns(self, component: mujoco.mjtState) -> slice:
-        """Where a component lies in an integration state, whose components are in the order of their bits."""
-        before = mujoco.mjtState.mjSTATE_INTEGRATION.value & (component.value - 1)
-        start = mujoco.mj_stateSize(self.model, before)
-        return slice(start, start + mujoco.mj_stateSize(self.model, component.value))
 
     def state(self) -> Array:
         """A copy of every simulation's integration state, shape (n, nstate)."""
@@ -184,8 +181,6 @@ class RobotBatch:
     def set_state(self, state: Array) -> None:
         """Restore what :meth:`state` returned and recompute the derived quantities."""
         self.overwrite(state)
-        self._last_time[:] = self._time
-        self._recorder.forget(slice(None))
         self.refresh(np.arange(self.num_envs))
 
     def snapshot(self, env: int) -> mujoco.MjData:

@@ -1,4 +1,4 @@
-"""Which simulations have gone wrong, and why: checked after every control step, for every environment of a robot.
+"""Which simulations have gone wrong, and why: checked after every control step, for every environment.
 
 MuJoCo itself goes on with numbers that are not finite, and says so only in a counter.
 """
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..robots.spec import Array
+from .columns import staging_columns
 
 CAUSES = ("non_finite", "velocity", "height", "distance", "time", "solver", "action")
 """What can be wrong with an environment; code c stands for ``CAUSES[c - 1]`` and 0 for nothing:
@@ -31,7 +32,12 @@ MAX_DISTANCE = 1000.0
 MAX_ACTION = 1e6
 """[-]; smaller actions are clipped, larger ones come from a policy that has come apart."""
 
-_ROOT_BOUND = np.array([MAX_DISTANCE, MAX_DISTANCE, MAX_HEIGHT])
+_COLUMNS = staging_columns(num_sensors=0)
+_VELOCITIES = np.r_[_COLUMNS["root_lin_vel_w"], _COLUMNS["base_ang_vel_b"], _COLUMNS["joint_vel"]]
+_BOUNDS = np.full(_COLUMNS["joint_vel"].stop, np.finfo(np.float64).max)
+"""Largest magnitude of each position and velocity in a staging row, shape (77,)."""
+_BOUNDS[_COLUMNS["root_pos"]] = (MAX_DISTANCE, MAX_DISTANCE, MAX_HEIGHT)
+_BOUNDS[_VELOCITIES] = MAX_SPEED
 _CODE = {cause: code for code, cause in enumerate(CAUSES, start=1)}
 
 
@@ -43,17 +49,12 @@ mujoco.set_mju_user_warning(_ignore)
 
 
 def diagnose(
-    qpos: Array,
-    qvel: Array,
-    advanced: NDArray[np.bool_],
-    warned: NDArray[np.bool_],
-    wild: NDArray[np.bool_],
+    rows: Array, advanced: NDArray[np.bool_], warned: NDArray[np.bool_], wild: NDArray[np.bool_]
 ) -> NDArray[np.int64]:
-    """Judge simulations after a control step.
+    """Judge environments after a control step.
 
     Args:
-        qpos: positions, root first, shape (n, nq).
-        qvel: velocities, shape (n, nv).
+        rows: staging rows in double precision, of which positions and velocities count, shape (n, 77 or more).
         advanced: whether the clock advanced, shape (n,).
         warned: whether MuJoCo warned or refused, shape (n,).
         wild: whether the action was absurd, shape (n,).
@@ -61,54 +62,49 @@ def diagnose(
     Returns:
         Code of the first cause that applies (``action`` before the others, then in order), 0 if none; shape (n,).
     """
-    if advanced.all() and not (warned | wild).any() and _sound(qpos, qvel):
-        return np.zeros(len(qpos), dtype=np.int64)
-    finite = np.isfinite(qpos).all(axis=1) & np.isfinite(qvel).all(axis=1)
+    moved = rows[:, : len(_BOUNDS)]
+    bounded = np.abs(moved) <= _BOUNDS  # nothing is, that is not finite
+    if advanced.all() and not (warned | wild).any() and bounded.all():
+        return np.zeros(len(rows), dtype=np.int64)
     signs = {
         "action": wild,
-        "non_finite": ~finite,
-        "velocity": ~(np.abs(qvel) <= MAX_SPEED).all(axis=1),
-        "height": ~(np.abs(qpos[:, 2]) <= MAX_HEIGHT),
-        "distance": ~(np.abs(qpos[:, :3]) <= _ROOT_BOUND).all(axis=1),
+        "non_finite": ~np.isfinite(moved).all(axis=1),
+        "velocity": ~bounded[:, _VELOCITIES].all(axis=1),
+        "height": ~bounded[:, 2],
+        "distance": ~bounded[:, :3].all(axis=1),
         "time": ~advanced,
         "solver": warned,
     }
     return np.select(list(signs.values()), [_CODE[cause] for cause in signs], 0)
 
 
-def _sound(qpos: Array, qvel: Array) -> bool:
-    """Whether all simulations are finite and within bounds, by whole-array sums and extremes: the usual case."""
-    return bool(
-        np.isfinite(qpos.sum())
-        and qvel.max() <= MAX_SPEED
-        and qvel.min() >= -MAX_SPEED
-        and (np.abs(qpos[:, :3]) <= _ROOT_BOUND).all()
-    )
-
-
 class FlightRecorder:
-    """The last few states of every simulation of a robot, overwritten in turn."""
+    """What MuJoCo wrote of every environment of a pool in the last few steps, overwritten in turn."""
 
     LENGTH = 8
 
-    def __init__(self, num_envs: int, state_size: int) -> None:
+    def __init__(self, num_envs: int, width: int) -> None:
         """Start empty."""
-        self._states = np.zeros((self.LENGTH, num_envs, state_size))
+        self._rows = np.zeros((self.LENGTH, num_envs, width))
         self._age = np.zeros(num_envs, dtype=np.int64)
-        self._next = 0
+        self._latest = 0
 
-    def add(self, states: Array) -> None:
-        """Keep one state of every simulation, shape (n, state_size)."""
-        self._states[self._next] = states
-        self._next = (self._next + 1) % self.LENGTH
+    @property
+    def latest(self) -> Array:
+        """Rows as they are now, shape (num_envs, width)."""
+        return self._rows[self._latest]
+
+    def next(self) -> Array:
+        """Rows to be written in a new step: the oldest, which they replace, shape (num_envs, width)."""
+        self._latest = (self._latest + 1) % self.LENGTH
         self._age += 1
+        return self.latest
 
-    def forget(self, ids: NDArray[np.int64] | slice) -> None:
-        """Drop what was kept of some simulations, which begin anew."""
-        self._age[ids] = 0
+    def forget(self, envs: NDArray[np.int64] | slice) -> None:
+        """Drop what was kept of some environments, which begin anew."""
+        self._age[envs] = 0
 
     def last(self, env: int) -> Array:
-        """States of one simulation since it began, oldest first, shape (k, state_size), k at most ``LENGTH``."""
+        """Rows of the steps of one environment since it began, oldest first, shape (k, width), k at most ``LENGTH``."""
         count = min(self.LENGTH, int(self._age[env]))
-        order = (self._next - count + np.arange(count)) % self.LENGTH
-        return self._states[order, env]
+        return self._rows[np.arange(self._latest - count + 1, self._latest + 1) % self.LENGTH, env]

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from eagle_rl.errors import ConfigError
 from envs.humanoid_env import HumanoidEnv
+from envs.sim.columns import staging_columns
 from envs.sim.fault import MAX_FILES, load_fault
 from envs.sim.health import CAUSES, MAX_DISTANCE, MAX_HEIGHT, MAX_SPEED, FlightRecorder, diagnose
 from tests.envs.worlds import LOG_INTERVAL, actions, assert_same, make_env, robot
@@ -104,15 +105,18 @@ def test_solver_warnings_count() -> None:
 @given(
     qpos=st.lists(st.floats(width=64), min_size=3, max_size=3),
     qvel=st.floats(width=64),
+    moving=st.sampled_from(["root_lin_vel_w", "base_ang_vel_b", "joint_vel"]),
     advanced=st.booleans(),
     warned=st.booleans(),
     wild=st.booleans(),
 )
 def test_diagnosis_names_the_first_cause(
-    qpos: list[float], qvel: float, advanced: bool, warned: bool, wild: bool
+    qpos: list[float], qvel: float, moving: str, advanced: bool, warned: bool, wild: bool
 ) -> None:
-    flags = [np.array([x]) for x in (advanced, warned, wild)]
-    code = diagnose(np.array([qpos]), np.array([[qvel]]), *flags)[0]
+    columns = staging_columns(num_sensors=0)
+    row = np.zeros((1, columns["sensors"].stop))
+    row[:, columns["root_pos"]], row[:, columns[moving].stop - 1] = qpos, qvel
+    code = diagnose(row, *(np.array([x]) for x in (advanced, warned, wild)))[0]
     if wild:
         expected = "action"
     elif not np.isfinite([*qpos, qvel]).all():

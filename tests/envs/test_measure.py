@@ -14,7 +14,7 @@ from torch import Tensor
 from envs.geometry import from_yaw_frame, heading_of, into_yaw_frame, quat_from_yaw, rotate_inverse
 from envs.measure import measured
 from envs.robots.sensors import NUM_SENSORS, SENSOR_SLICES
-from envs.sim.pool import staging_columns
+from envs.sim.columns import staging_columns
 from tests.states import quaternion, quiet_state, random_robots
 
 COLUMNS = staging_columns(NUM_SENSORS)

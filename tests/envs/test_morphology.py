@@ -29,7 +29,7 @@ SIM = SimCfg()
 
 def batch_of(spec: RobotSpec, length: list[float], mass: list[float]) -> RobotBatch:
     """Simulations of one robot in several sizes."""
-    batch = RobotBatch(spec, build_model(spec, SIM), len(length), SIM.decimation, 1)
+    batch = RobotBatch(spec, build_model(spec, SIM), len(length), SIM.decimation)
     bodies = (len(length), batch.model.nbody)
     scale = np.repeat(np.array(mass)[:, None], bodies[1], axis=1)
     batch.change_bodies(np.array(length), scale, np.zeros(bodies), np.zeros((*bodies, 3)))

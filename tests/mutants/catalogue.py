@@ -27,6 +27,7 @@ GEOMETRY = "envs/geometry.py"
 SLOTS = "envs/robots/slots.py"
 EMBODIMENT = "envs/robots/embodiment.py"
 POOLING = "envs/pooling.py"
+STAGING = "envs/sim/staging.py"
 AIDS = "envs/mdp/aids.py"
 POSTURE = "envs/robots/posture.py"
 RESTING = "envs/mdp/posture.py"
@@ -118,6 +119,10 @@ MUTANTS: tuple[Mutant, ...] = (
     ),
     Mutant(POOLING, "0.5 * ratio * (upper - lower)", "ratio * (upper - lower)", "envs/test_pooling.py"),
     Mutant(POOLING, "spec.effort_limit / spec.stiffness", "spec.stiffness / spec.effort_limit", "envs/test_pooling.py"),
+    Mutant(STAGING, '"joint_pos"]] -= self._zero', '"joint_pos"]] += self._zero', "envs/test_physics.py"),
+    Mutant(STAGING, '"joint_torque"]] -= self.damping', '"joint_torque"]] += self.damping', "envs/test_physics.py"),
+    Mutant(STAGING, "(self._target_slots) + self", "(self._target_slots) - self", "envs/test_physics.py"),
+    Mutant("envs/sim/batch.py", "env=self.first_env + env", "env=env", "envs/test_threads.py"),
     # observations
     Mutant(
         OBSERVATIONS, "state.joint_pos - robots.default", "state.joint_pos + robots.default", "mdp/test_observations.py"
