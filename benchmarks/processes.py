@@ -27,7 +27,7 @@ def _rate(num_envs: int, processes: int, torch_threads: int, physics_threads: in
         command = [sys.executable, *launcher, "train.py", "ppo", f"num_envs={num_envs}", "--out", folder]
         command += [f"run.torch_threads={torch_threads}", f"run.num_threads={physics_threads}"]
         command += [f"plan.generalist_env_steps={ITERATIONS * 24 * num_envs * processes}"]
-        command += ["plan.judge_envs_per_robot=0", "run.save_interval=1000"]
+        command += ["plan.judge_envs_per_robot=0", "run.save_interval=1000", "run.compile=always"]
         environment = {**os.environ, "OMP_NUM_THREADS": "1"}
         done = subprocess.run(command, cwd=data_root(), env=environment, capture_output=True, text=True, check=False)
         if done.returncode != 0:
