@@ -1,11 +1,10 @@
-"""Actions and all that PPO wants to know of them, computed just as the update will, so that its ratios start at one."""
+"""Actions and how likely they were, computed just as the update will, so that its ratios start at one."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import torch
-from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 from torch import Tensor
 
@@ -18,7 +17,7 @@ from eagle_rl.models.distribution import log_prob
 
 @dataclass(frozen=True)
 class Decision:
-    """What was done in each environment, and how likely and how good that was held to be."""
+    """What was done in each environment, and how likely that was."""
 
     actions: Tensor
     """Shape (N, 32), zero in absent slots."""
@@ -28,22 +27,19 @@ class Decision:
     """Of their distribution, shape (N, 32), zero in absent slots."""
     log_prob: Tensor
     """Shape (N,)."""
-    value: Tensor
-    """Shape (N, 1)."""
 
 
 class Acting:
     """Samples actions; all rows at once, which even with 512 of them is quicker than to share them out."""
 
-    def __init__(self, actor: EagleActor, critic: MLPModel, mixed_precision: bool) -> None:
+    def __init__(self, actor: EagleActor, mixed_precision: bool) -> None:
         """With ``mixed_precision`` hidden layers multiply in bfloat16."""
-        self._shared = Shared(_Acting(actor, critic, mixed_precision))
-        self._groups = (*ACTOR_INPUTS, "slot_mask", *critic.obs_groups)
+        self._shared = Shared(_Acting(actor, mixed_precision))
         self.compile = self._shared.compile
 
     def __call__(self, obs: TensorDict) -> Decision:
         """Sample at some observations."""
-        tensors = {group: obs[group].contiguous() for group in self._groups}
+        tensors = {group: obs[group].contiguous() for group in (*ACTOR_INPUTS, "slot_mask")}
         tensors["noise"] = torch.randn_like(tensors["slot_mask"])
         (found,) = self._shared([Share(tensors, index=0, count=1, size=len(tensors["noise"]))])
         return Decision(*found)
@@ -52,15 +48,15 @@ class Acting:
 class _Acting(Computation):
     """What becomes of a share's rows."""
 
-    def __init__(self, actor: EagleActor, critic: MLPModel, mixed_precision: bool) -> None:
+    def __init__(self, actor: EagleActor, mixed_precision: bool) -> None:
         super().__init__()
-        self.actor, self.critic = actor, critic
+        self.actor = actor
         self._mixed_precision = mixed_precision
 
     def forward(self, share: Share) -> tuple[Tensor, ...]:
         """The fields of a :class:`Decision`."""
         mask = share["slot_mask"]
         with torch.autocast(mask.device.type, torch.bfloat16, self._mixed_precision, cache_enabled=False):
-            policy, value = Policy.of(self.actor, share), self.critic(share)
+            policy = Policy.of(self.actor, share)
         actions = (policy.mean + policy.std * share["noise"]) * mask
-        return actions, policy.mean, policy.std * mask, log_prob(actions, policy.mean, policy.std, mask), value
+        return actions, policy.mean, policy.std * mask, log_prob(actions, policy.mean, policy.std, mask)

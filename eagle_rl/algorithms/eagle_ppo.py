@@ -21,6 +21,7 @@ from eagle_rl.algorithms.rollout import Rollout
 from eagle_rl.algorithms.specialists import SpecialistBank
 from eagle_rl.algorithms.stopwatch import Stopwatch
 from eagle_rl.algorithms.terms import Distill, Estimation, Kickstart, Mirror, Ppo
+from eagle_rl.algorithms.valuing import Valuing
 from eagle_rl.config.schema import AlgoCfg
 from eagle_rl.errors import HealthError
 from eagle_rl.models import EagleActor
@@ -78,7 +79,8 @@ class EaglePPO(PPO):
         self._withheld_steps = 0
         self.stopwatch = Stopwatch()
         self.gradient = Gradient(actor, critic, self.use_mixed_precision)
-        self.acting = Acting(actor, critic, self.use_mixed_precision)
+        self.acting = Acting(actor, self.use_mixed_precision)
+        self.valuing = Valuing(critic, self.use_mixed_precision)
         if cfg.use_ppo_loss:
             self.gradient.terms.append(Ppo(critic, cfg))
         groups = [
@@ -121,7 +123,8 @@ class EaglePPO(PPO):
             self.gradient.compile()
         decision, step = self.acting(obs), self.transition
         step.hidden_states, step.observations = (None, None), obs
-        step.actions, step.values, step.actions_log_prob = decision.actions, decision.value, decision.log_prob
+        step.actions, step.actions_log_prob = decision.actions, decision.log_prob
+        step.values = self.storage.values[0]  # not yet known: see compute_returns
         step.distribution_params = (decision.mean, decision.std)
         return decision.actions
 
@@ -129,13 +132,13 @@ class EaglePPO(PPO):
         """Record one step; where the environment cuts returns, the value of the true final observation goes on."""
         ids = extras["final_ids"].to(self.device)
         if len(ids):
-            final = self.critic(extras["final_observations"].to(self.device)).squeeze(-1)
-            rewards = rewards.index_add(0, ids, self.gamma * final)
+            self.valuing.cut(self.storage.step, ids, extras["final_observations"].to(self.device))
             dones = dones.index_fill(0, ids, 1)
         super().process_env_step(obs, rewards, dones, {})
 
     def compute_returns(self, obs: TensorDict) -> None:
-        """Compute returns and advantages; those of all processes are normalized together."""
+        """Compute values, returns and advantages; those of all processes are normalized together."""
+        self.valuing.value(self.storage, self.gamma)
         super().compute_returns(obs)
         if self.gpu_world_size > 1:
             self._normalize_over_processes()

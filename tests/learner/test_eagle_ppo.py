@@ -130,7 +130,10 @@ def test_returns_are_cut_and_bootstrapped_with_the_value_of_their_true_final_obs
     with torch.no_grad():
         alg.act(obs)
         alg.process_env_step(obs, torch.full((env.num_envs,), 2.0), torch.zeros(env.num_envs).bool(), extras)
+        for _ in range(2):  # what is added once is not added again
+            alg.valuing.value(alg.storage, alg.gamma)
         values = alg.critic(final)[:, 0]
+        torch.testing.assert_close(alg.storage.values[0], alg.critic(obs))
     expected = torch.full((env.num_envs,), 2.0)
     expected[4] += 0.9 * values[0]
     expected[1] += 0.9 * values[1]

@@ -190,7 +190,7 @@ MUTANTS: tuple[Mutant, ...] = (
     ),
     Mutant(GAUSSIAN, "0.5 + _LOG_SQRT_2_PI) * mask)", "_LOG_SQRT_2_PI) * mask)", "learner/test_distribution.py"),
     Mutant(GAUSSIAN, "(old_std / std).square()", "(std / old_std).square()", "learner/test_distribution.py"),
-    Mutant(PPO, "self.gamma * final", "final", LEARNER_TESTS),
+    Mutant("eagle_rl/algorithms/valuing.py", "gamma * value", "value", LEARNER_TESTS),
     Mutant(PPO, "dones = dones.index_fill(0, ids, 1)", "dones = dones.clone()", LEARNER_TESTS),
     Mutant(ENV, "time_outs | (self._about_to_be_surprised() & ~dones)", "time_outs", "envs/test_humanoid_env.py"),
     Mutant(
