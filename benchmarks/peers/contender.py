@@ -1,0 +1,124 @@
+"""A program that is measured, in a process and mostly in an interpreter of its own."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import subprocess
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from eagle_rl.errors import EagleError
+from eagle_rl.paths import data_root
+
+from .turns import About, Rates, Setting
+
+
+@dataclass(frozen=True)
+class Program:
+    """Who is measured, and how to start it."""
+
+    name: str
+    module: str
+    """In this package."""
+    python: str
+    """Interpreter of the environment it is installed in."""
+    variant: str = ""
+
+
+class Contender:
+    """A started program, which waits asleep until it is its turn."""
+
+    def __init__(self, program: Program, setting: Setting, folder: Path) -> None:
+        """Start it in a folder of its own below ``folder``, and wait until it is ready.
+
+        Raises:
+            EagleError: it failed.
+        """
+        own = folder / f"{program.name} {setting.num_envs}"
+        own.mkdir()
+        self.name, self._log = program.name, own / "log"
+        words = json.dumps(asdict(replace(setting, variant=program.variant)))
+        read, write = os.pipe()
+        self._answers = os.fdopen(read)
+        command = [program.python, "-m", f"benchmarks.peers.{program.module}", words, str(write)]
+        environment = {**os.environ, "PYTHONPATH": str(data_root())}
+        try:
+            with self._log.open("w") as log:
+                self._process = subprocess.Popen(
+                    command,
+                    cwd=own,
+                    env=environment,
+                    stdin=subprocess.PIPE,
+                    stdout=log,
+                    stderr=log,
+                    text=True,
+                    pass_fds=[write],
+                )
+        except OSError as error:
+            self._answers.close()
+            raise EagleError(f"{program.name} cannot be started: {error}") from error
+        finally:
+            os.close(write)
+        self.about = About(**self._answer())
+
+    def turn(self) -> Rates:
+        """Let it measure once.
+
+        Raises:
+            EagleError: it failed.
+        """
+        assert self._process.stdin is not None
+        with contextlib.suppress(BrokenPipeError):
+            self._process.stdin.write("\n")
+            self._process.stdin.flush()
+        return self._answer()
+
+    def stop(self) -> None:
+        """End it, which is what the end of its input tells it to do."""
+        self._process.communicate()
+        self._answers.close()
+
+    def _answer(self) -> Any:
+        line = self._answers.readline()
+        if not line:
+            self.stop()
+            raise EagleError(f"{self.name} failed:\n{self._log.read_text()[-2000:]}")
+        return json.loads(line)
+
+
+def take_turns(
+    programs: list[Program], setting: Setting, rounds: int, folder: Path, say: Callable[[str], None]
+) -> tuple[dict[str, About], dict[str, list[Rates]]]:
+    """Start all programs, then let one after another measure, so many times; one that cannot be started is left out.
+
+    Args:
+        programs: who takes part.
+        setting: what to measure; each program's variant is its own.
+        rounds: how many turns each has.
+        folder: where their files go.
+        say: told what goes on.
+
+    Returns:
+        What each is, and what it measured.
+    """
+    contenders: list[Contender] = []
+    try:
+        for program in programs:
+            say(f"starting {program.name} with {setting.num_envs} environments")
+            try:
+                contenders.append(Contender(program, setting, folder))
+            except EagleError as error:
+                say(f"left out: {error}")
+        rates: dict[str, list[Rates]] = {contender.name: [] for contender in contenders}
+        for number in range(1, rounds + 1):
+            for contender in contenders:
+                say(f"round {number} of {rounds}: {contender.name}")
+                rates[contender.name].append(contender.turn())
+    finally:
+        for contender in contenders:
+            contender.stop()
+    return {contender.name: contender.about for contender in contenders}, rates
