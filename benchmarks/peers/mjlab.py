@@ -37,8 +37,8 @@ def prepare(setting: Setting) -> tuple[About, Callable[[], Rates]]:
         control=control(cfg.decimation, cfg.sim.mujoco.timestep),
         threads=f"1 of Warp's kernels, {torch.get_num_threads()} of torch",
         differs=f"{algorithm.num_learning_epochs} epochs of {algorithm.num_mini_batches} batches; actor "
-        f"{list(agent.actor.hidden_dims)} and critic {list(agent.critic.hidden_dims)}, nothing else; twice our physics "
-        "steps; made for an NVIDIA GPU; nothing holds it upright",
+        f"{list(agent.actor.hidden_dims)} and critic {list(agent.critic.hidden_dims)}, no other networks; randomizes "
+        "friction, a centre of mass, encoders and pushes; made for an NVIDIA GPU; nothing holds it upright",
     )
     return about, lambda: stepping.rates() | training.rates()
 

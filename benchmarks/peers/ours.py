@@ -9,6 +9,7 @@ import torch
 
 from benchmarks.workloads import experiment, make_env, make_runner
 from eagle_rl.machine import usable_cores
+from eagle_rl.models.precision import multiplies_in_bfloat16
 from eagle_rl.runners.provenance import versions
 
 from .turns import About, Rates, Setting, Stepping, Training, control, serve
@@ -29,13 +30,14 @@ def prepare(setting: Setting) -> tuple[About, Callable[[], Rates]]:
 
     stepping = Stepping(step, setting)
     net, sim = cfg.algo.network, cfg.task.sim
+    precision = "bfloat16" if multiplies_in_bfloat16(cfg.algo.precision, "cpu") else "float32"
     about = About(
         versions=f"MuJoCo {versions()['mujoco']}, torch {versions()['torch']}",
         control=control(sim.decimation, sim.physics_dt),
         threads=f"{cores} of physics, {cores} of the learner",
-        differs=f"{cfg.algo.num_learning_epochs} epochs of {cfg.algo.num_mini_batches} batches of {cfg.algo.precision} "
-        f"precision; actor {net.actor_dims} with encoder {net.encoder_dims} and estimator {net.estimator_dims}, "
-        f"critic {net.critic_dims}, mirror loss; everything randomized; compiled",
+        differs=f"{cfg.algo.num_learning_epochs} epochs of {cfg.algo.num_mini_batches} batches in {precision}; actor "
+        f"{net.actor_dims} with encoder {net.encoder_dims} and estimator {net.estimator_dims}, critic "
+        f"{net.critic_dims}, mirror loss; everything randomized; beginners held by a harness; compiled",
     )
     return about, lambda: stepping.rates() | training.rates()
 

@@ -58,7 +58,7 @@ def prepare(setting: Setting) -> tuple[About, Callable[[], Rates]]:
         control=control(round(cfg.env.ctrl_dt / sim_dt), sim_dt),
         threads=f"one of physics a core, {torch.get_num_threads()} of torch",
         differs=f"{algorithm.num_learning_epochs} epochs of {algorithm.num_mini_batches} batches; actor "
-        f"{cfg.algo.actor.hidden_dims} and critic {cfg.algo.critic.hidden_dims}, nothing else; randomizes gains, "
+        f"{cfg.algo.actor.hidden_dims} and critic {cfg.algo.critic.hidden_dims}, no other networks; randomizes gains, "
         "poses and velocities of the start and observation noise only; without its meshes; nothing holds it upright",
     )
     return about, lambda: stepping.rates() | training.rates()
