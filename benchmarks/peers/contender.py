@@ -116,8 +116,9 @@ def take_turns(
         rates: dict[str, list[Rates]] = {contender.name: [] for contender in contenders}
         for number in range(1, rounds + 1):
             for contender in contenders:
-                say(f"round {number} of {rounds}: {contender.name}")
                 rates[contender.name].append(contender.turn())
+                shown = ", ".join(f"{kind} {rate:.0f}" for kind, rate in rates[contender.name][-1].items())
+                say(f"round {number} of {rounds}: {contender.name}: {shown} env-steps/s")
     finally:
         for contender in contenders:
             contender.stop()
