@@ -17,6 +17,7 @@ from statistics import median
 from eagle_rl.cli.arguments import count, duration
 from eagle_rl.cli.bench import describe_machine, table
 from eagle_rl.config.schema import SimCfg
+from eagle_rl.errors import EagleError
 from eagle_rl.machine import usable_cores
 from envs.robots.load import load_robot
 from envs.robots.model import add_floor, build_spec
@@ -66,6 +67,8 @@ def _programs(args: argparse.Namespace) -> list[Program]:
 
 def figures(num_envs: int, rates: Mapping[str, Sequence[Rates]]) -> list[Figure]:
     """Each one's rates as shares of ours, from medians over the rounds."""
+    if not rates.get(OURS.name):
+        raise EagleError("There is nothing to compare peers with: we could not be measured.")
     ours = {kind: median(turn[kind] for turn in rates[OURS.name]) for kind in rates[OURS.name][0]}
     rows = []
     for kind, our_rate in ours.items():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import select
 import subprocess
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
@@ -15,6 +16,9 @@ from eagle_rl.errors import EagleError
 from eagle_rl.paths import data_root
 
 from .turns import About, Rates, Setting
+
+PATIENCE = 900.0
+"""How long a program may take to get ready, or for a turn [s]."""
 
 
 @dataclass(frozen=True)
@@ -83,17 +87,21 @@ class Contender:
         self._answers.close()
 
     def _answer(self) -> Any:
-        line = self._answers.readline()
+        answered, _, _ = select.select([self._answers], [], [], PATIENCE)
+        if not answered:
+            self._process.kill()
+        line = self._answers.readline() if answered else ""
         if not line:
             self.stop()
-            raise EagleError(f"{self.name} failed:\n{self._log.read_text()[-2000:]}")
+            happened = "failed" if answered else f"did not answer for {PATIENCE:g} s"
+            raise EagleError(f"{self.name} {happened}:\n{self._log.read_text()[-2000:]}")
         return json.loads(line)
 
 
 def take_turns(
     programs: list[Program], setting: Setting, rounds: int, folder: Path, say: Callable[[str], None]
 ) -> tuple[dict[str, About], dict[str, list[Rates]]]:
-    """Start all programs, then let one after another measure, so many times; one that cannot be started is left out.
+    """Start all programs, then let one after another measure, so many times; what fails is left out from then on.
 
     Args:
         programs: who takes part.
@@ -113,13 +121,20 @@ def take_turns(
                 contenders.append(Contender(program, setting, folder))
             except EagleError as error:
                 say(f"left out: {error}")
-        rates: dict[str, list[Rates]] = {contender.name: [] for contender in contenders}
+        abouts = {contender.name: contender.about for contender in contenders}
+        rates: dict[str, list[Rates]] = {name: [] for name in abouts}
         for number in range(1, rounds + 1):
-            for contender in contenders:
-                rates[contender.name].append(contender.turn())
-                shown = ", ".join(f"{kind} {rate:.0f}" for kind, rate in rates[contender.name][-1].items())
+            for contender in list(contenders):
+                try:
+                    measured = contender.turn()
+                except EagleError as error:
+                    say(f"left out from now on: {error}")
+                    contenders.remove(contender)
+                    continue
+                rates[contender.name].append(measured)
+                shown = ", ".join(f"{kind} {rate:.0f}" for kind, rate in measured.items())
                 say(f"round {number} of {rounds}: {contender.name}: {shown} env-steps/s")
     finally:
         for contender in contenders:
             contender.stop()
-    return {contender.name: contender.about for contender in contenders}, rates
+    return abouts, rates

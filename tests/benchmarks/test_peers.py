@@ -8,9 +8,11 @@ import sys
 
 import pytest
 
+from benchmarks.peers import contender
 from benchmarks.peers.__main__ import figures
 from benchmarks.peers.contender import Program, take_turns
 from benchmarks.peers.turns import COLLECTION, STEP, Setting, Training
+from eagle_rl.errors import EagleError
 from eagle_rl.paths import data_root
 
 PROGRAM = """
@@ -49,6 +51,21 @@ def test_a_peer_that_cannot_be_started_is_left_out(tmp_path):
     assert take_turns(programs, Setting(1, 0.0), 1, tmp_path, said.append) == ({}, {})
     assert "No module named benchmarks.peers.no_such_program" in said[1]
     assert "absent cannot be started" in said[3]
+
+
+def test_a_peer_that_does_not_answer_in_time_is_ended(tmp_path, monkeypatch):
+    (tmp_path / "sleepy").write_text("#!/bin/sh\nexec sleep 60\n")
+    (tmp_path / "sleepy").chmod(0o755)
+    monkeypatch.setattr(contender, "PATIENCE", 0.1)
+    said: list[str] = []
+    programs = [Program("sleeper", "turns", str(tmp_path / "sleepy"))]
+    assert take_turns(programs, Setting(1, 0.0), 1, tmp_path, said.append) == ({}, {})
+    assert "sleeper did not answer for 0.1 s" in said[1]
+
+
+def test_without_our_rates_there_is_no_table():
+    with pytest.raises(EagleError, match="could not be measured"):
+        figures(64, {"ours": [], "peer": [{STEP: 1.0}]})
 
 
 def test_collection_is_what_of_an_iteration_is_not_its_update(monkeypatch):
