@@ -91,7 +91,7 @@ def _measure(part: str, args: argparse.Namespace, threads: int) -> list[Figure]:
     return measurements[part]()
 
 
-def _machine(envs: int, threads: int) -> dict[str, str]:
+def describe_machine(envs: int, threads: int) -> dict[str, str]:
     """What the figures depend on."""
     cpuinfo = Path("/proc/cpuinfo")
     lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
@@ -105,7 +105,7 @@ def _machine(envs: int, threads: int) -> dict[str, str]:
     } | versions()
 
 
-def _table(machine: dict[str, str], figures: Sequence[Figure]) -> str:
+def table(machine: dict[str, str], figures: Sequence[Figure]) -> str:
     """Machine and figures in Markdown."""
     about = ", ".join(f"{name} {value}" for name, value in machine.items())
     rows = [f"| {f.name} | {_shown(f)} | {f.bar} | {f.detail} |" for f in figures]
@@ -125,12 +125,12 @@ def main(argv: Sequence[str]) -> int:
             raise EagleError(f"eagle bench: no part {part!r}.{did_you_mean(part, PARTS)} Known: {', '.join(PARTS)}.")
     threads = args.threads or usable_cores()
     _import_benchmarks()
-    machine = _machine(args.envs, threads)
+    machine = describe_machine(args.envs, threads)
     figures: list[Figure] = []
     for part in parts:
         print(f"measuring: {PARTS[part]}", file=sys.stderr)
         figures += _measure(part, args, threads)
-    print(_table(machine, figures))
+    print(table(machine, figures))
     if args.json is not None:
         args.json.write_text(json.dumps({"machine": machine, "figures": [asdict(f) for f in figures]}, indent=1))
     return 0
