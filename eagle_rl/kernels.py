@@ -23,7 +23,7 @@ Kernel = Callable[..., Sequence[Tensor]]
 """Takes tensors of just the shapes, types and strides it was made for."""
 
 _TRUSTING = {"size_asserts": False, "alignment_asserts": False}
-"""Whoever calls a kernel sees to it that its inputs are as promised; to check each again takes a tenth of a small one."""
+"""Whoever calls a kernel sees to it that its inputs are as promised; to check them takes a tenth of a small one."""
 
 
 def find_compiler() -> str:
