@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import threading
 import time
@@ -14,6 +13,7 @@ from hypothesis import strategies as st
 
 from eagle_rl.models.precision import set_up_torch
 from eagle_rl.threads import num_threads, share_out, use_threads
+from tests.forked import exit_code_in_fork
 
 
 @settings(max_examples=40, deadline=None)
@@ -114,15 +114,7 @@ def work_in_child() -> None:
 def test_a_forked_process_makes_threads_of_its_own():
     use_threads(2)
     share_out(abs, [1, 2])
-    child = multiprocessing.get_context("fork").Process(target=work_in_child)
-    child.start()
-    child.join(60)
-    hangs = child.is_alive()
-    if hangs:
-        child.kill()
-        child.join()
-    assert not hangs, "the child waits for threads of its parent"
-    assert child.exitcode == 0, "the child computes something else than its parent"
+    assert exit_code_in_fork(work_in_child) == 0, "the child computes something else than its parent"
 
 
 def test_fewer_threads_are_let_go():

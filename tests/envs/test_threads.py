@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +17,7 @@ from envs.sim.fault import load_fault
 from envs.sim.health import CAUSES
 from tests.envs.test_resume import BUSY, flat, run, saved_and_loaded
 from tests.envs.worlds import assert_same, make_env
+from tests.forked import exit_code_in_fork
 
 NAMES, NUM_ENVS, PER_ROBOT = ("h1", "g1", "t1"), 48, 16
 SICK = PER_ROBOT + 13
@@ -88,15 +88,8 @@ def test_a_forked_process_steps_with_threads_of_its_own() -> None:
     state = env.state_dict()
     run(env, range(3))  # which makes the threads
     env.load_state_dict(state)
-    child = multiprocessing.get_context("fork").Process(target=step_in_child, args=(env, run(parent, range(3))))
-    child.start()
-    child.join(60)
-    hangs = child.is_alive()
-    if hangs:
-        child.kill()
-        child.join()
-    assert not hangs, "the child waits for threads of its parent"
-    assert child.exitcode == 0, "the child simulates something else than its parent"
+    code = exit_code_in_fork(step_in_child, env, run(parent, range(3)))
+    assert code == 0, "the child simulates something else than its parent"
 
 
 def test_there_is_one_thread_per_core_unless_said_otherwise() -> None:
