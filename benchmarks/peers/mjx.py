@@ -15,7 +15,8 @@ from .turns import About, Rates, Setting, Stepping, control, serve
 
 def prepare(setting: Setting) -> tuple[About, Callable[[], Rates]]:
     """A compiled control step of all simulations."""
-    jax.config.update("jax_cpu_enable_async_dispatch", False)  # with it a step has waited forever on two cores
+    # With asynchronous dispatch a step of 320 environments once waited forever; without it, it once did so too.
+    jax.config.update("jax_cpu_enable_async_dispatch", False)
     host = mujoco.MjModel.from_xml_path(setting.model)
     model = mjx.put_model(host)
 

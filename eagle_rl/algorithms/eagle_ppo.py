@@ -132,7 +132,7 @@ class EaglePPO(PPO):
         """Record one step; where the environment cuts returns, the value of the true final observation goes on."""
         ids = extras["final_ids"].to(self.device)
         if len(ids):
-            self.valuing.cut(self.storage.step, ids, extras["final_observations"].to(self.device))
+            self.storage.cuts.append((self.storage.step, ids, extras["final_observations"].to(self.device)))
             dones = dones.index_fill(0, ids, 1)
         super().process_env_step(obs, rewards, dones, {})
 

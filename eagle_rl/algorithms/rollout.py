@@ -1,18 +1,34 @@
-"""The rollout, with minibatches that are shared out among threads."""
+"""The rollout, with where its returns are cut and minibatches that are shared out among threads."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import torch
 from rsl_rl.storage import RolloutStorage
+from tensordict import TensorDict
 from torch import Tensor
 
 from eagle_rl.algorithms.sharing import Share
 
+Cut = tuple[int, Tensor, TensorDict]
+"""A step, the environments whose returns end with it, shape (n,), and their final observations."""
+
 
 class Rollout(RolloutStorage):
     """Gathers each minibatch once an update, by ``index_select``, which takes a fifth of the time of indexing."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        """As rsl_rl's, with nothing cut."""
+        super().__init__(*args, **kwargs)
+        self.cuts: list[Cut] = []
+        """Where the value beyond is still to be added to the rewards."""
+
+    def clear(self) -> None:
+        """Begin anew."""
+        super().clear()
+        self.cuts = []
 
     def minibatches(
         self, num_mini_batches: int, num_epochs: int, num_shares: int = 1, **common: Tensor

@@ -182,7 +182,3 @@ class RobotBatch:
         """Restore what :meth:`state` returned and recompute the derived quantities."""
         self.overwrite(state)
         self.refresh(np.arange(self.num_envs))
-
-    def snapshot(self, env: int) -> mujoco.MjData:
-        """An MjData of one simulation, for rendering."""
-        return self._batch.get_data(env)

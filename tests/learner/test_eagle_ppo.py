@@ -142,6 +142,15 @@ def test_returns_are_cut_and_bootstrapped_with_the_value_of_their_true_final_obs
     assert abs(values[0] - values[1]) > 1e-3, "the critic cannot tell the two apart, so the test shows nothing"
 
 
+def test_what_was_cut_in_a_rollout_that_is_thrown_away_is_not_added_to_the_next():
+    alg = make_runner().alg
+    alg.storage.cuts.append((0, torch.tensor([1]), alg.storage.observations[0][:1]))
+    alg.storage.clear()
+    alg.storage.rewards.zero_()
+    alg.valuing.value(alg.storage, alg.gamma)
+    assert not alg.storage.rewards.any()
+
+
 @pytest.mark.parametrize(
     ("desired_kl", "learning_rate", "expected"),
     [(1e-9, 1e-3, 1e-3 / 1.5), (1e3, 1e-3, 1.5e-3), (1e-9, 1.2e-5, 1e-5), (1e3, 1.9e-3, 2e-3)],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -15,7 +16,7 @@ from eagle_rl.algorithms.sharing import MIN_WORK
 from eagle_rl.errors import EagleWarning
 from eagle_rl.runners.on_policy import EagleRunner
 from eagle_rl.threads import use_threads
-from tests.learner.helpers import collect, make_runner, parameters
+from tests.learner.helpers import NETWORK, collect, make_runner, parameters
 from tests.toy import ToyEnv
 
 ENVS = 25
@@ -67,7 +68,8 @@ def imitating(runner: EagleRunner, method: str | None) -> EagleRunner:
 ALGOS: dict[str, tuple[dict[str, Any], str | None]] = {
     "ppo": ({}, None),
     "bfloat16": ({"precision": "bfloat16"}, None),
-    "two-sided": ({}, "eagle"),
+    "two-sided": ({"network": replace(NETWORK, symmetric=True)}, None),
+    "distillation": ({}, "eagle"),
     "imitation": ({"use_ppo_loss": False}, "eagle"),
     "kickstarting": ({}, "kickstart"),
     "clipped value": ({"use_clipped_value_loss": True}, None),
