@@ -117,7 +117,7 @@ class AlgoCfg:
     kickstart_decay: float = 0.005
     """lambda per iteration (ours)."""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
-    """Of the hidden layers in training; ``auto`` is bfloat16 where the CPU has instructions for it, too coarse once a
+    """Of the hidden layers in training; ``auto`` is bfloat16 where the CPU is quicker in it, too coarse once a
     policy's noise is small. Parameters, outputs, losses, evaluation and specialists' labels are float32 in any
     case (docs/performance.md) (ours)."""
     network: NetworkCfg = field(default_factory=NetworkCfg)

@@ -25,18 +25,39 @@ def test_a_processor_that_rounds_to_bfloat16_is_found_out(monkeypatch):
     """The product of the check, as a unit for bfloat16 computes it, fails the check and withdraws the permission."""
     product = torch.Tensor.__matmul__
     rounded = lambda a, b: product(a.bfloat16().float(), b.bfloat16().float())  # noqa: E731
+    on_a(monkeypatch, ZEN)
     monkeypatch.setattr(torch.Tensor, "__matmul__", rounded)
     precision.set_up_torch(1)
     assert torch.backends.mkldnn.matmul.fp32_precision == "ieee"
 
 
-@pytest.mark.parametrize("has", [True, False])
-def test_auto_is_bfloat16_where_the_processor_has_it(monkeypatch, has):
-    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": has}, raising=False)
-    assert precision.multiplies_in_bfloat16("auto", "cpu") is has
+ZEN = {"cpu_name": "AMD EPYC", "avx512_bf16": True, "amx_bf16": False}
+ZEN_WITHOUT = {"cpu_name": "AMD EPYC", "avx512_bf16": False, "amx_bf16": False}
+XEON = {"cpu_name": "Intel Xeon", "avx512_bf16": True, "amx_bf16": True}
+XEON_WITHOUT_AMX = {"cpu_name": "Intel Xeon", "avx512_bf16": True, "amx_bf16": False}
+
+
+def on_a(monkeypatch, processor):
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: processor, raising=False)
+
+
+@pytest.mark.parametrize(
+    ("processor", "quick"), [(ZEN, True), (ZEN_WITHOUT, False), (XEON, True), (XEON_WITHOUT_AMX, False), ({}, False)]
+)
+def test_auto_is_bfloat16_where_that_is_quicker(monkeypatch, processor, quick):
+    on_a(monkeypatch, processor)
+    assert precision.multiplies_in_bfloat16("auto", "cpu") is quick
     assert not precision.multiplies_in_bfloat16("auto", "cuda:0")
     assert precision.multiplies_in_bfloat16("bfloat16", "cuda:0")
     assert not precision.multiplies_in_bfloat16("float32", "cpu")
+
+
+@pytest.mark.parametrize(("processor", "library"), [(ZEN, "bf16"), (XEON, "ieee"), (XEON_WITHOUT_AMX, "ieee")])
+def test_mkl_multiplies_on_the_processors_of_its_maker_and_onednn_on_others(monkeypatch, processor, library):
+    on_a(monkeypatch, processor)
+    monkeypatch.setattr(precision, "_products_are_float32", lambda: True)
+    precision.set_up_torch(1)
+    assert torch.backends.mkldnn.matmul.fp32_precision == library, "see set_up_torch for which of them is quickest"
 
 
 def gradient(runner: EagleRunner) -> torch.Tensor:
