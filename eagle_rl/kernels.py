@@ -73,15 +73,15 @@ def _lighten(graph: fx.GraphModule) -> None:
     graph.recompile()
 
 
-def compile_graph(graph: fx.GraphModule, inputs: Sequence[Tensor], by_threads: bool = False) -> Kernel:
+def compile_graph(graph: fx.GraphModule, inputs: Sequence[Tensor]) -> Kernel:
     """The graph as one C++ kernel, for inputs of just these shapes and strides.
 
-    Inductor keeps what it compiled on disk, where only a graph of fake tensors is looked up.
+    Inductor keeps what it compiled on disk, where only a graph of fake tensors is looked up. What calls the parts of
+    the kernel is in C++ too, so that several threads may use it at a time.
 
     Args:
         graph: what :func:`record` returned.
         inputs: tensors like those it will get.
-        by_threads: whether several threads will call it at a time; its calls then leave Python alone.
 
     Raises:
         CompileError: there is no C++ compiler, or it failed.
@@ -99,7 +99,7 @@ def compile_graph(graph: fx.GraphModule, inputs: Sequence[Tensor], by_threads: b
             warnings.simplefilter("ignore")  # torch warns of torch
             from torch._inductor import compile as compile_with_inductor
 
-            kernel: Kernel = compile_with_inductor(graph, fakes, options={"cpp_wrapper": by_threads} | _TRUSTING)
+            kernel: Kernel = compile_with_inductor(graph, fakes, options={"cpp_wrapper": True} | _TRUSTING)
     except Exception as error:  # whatever the compiler and those who drive it raise
         raise CompileError(f"The kernel could not be compiled: {error}") from error
     return kernel

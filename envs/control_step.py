@@ -48,8 +48,11 @@ class Judgement(NamedTuple):
     """Whether it ended by its time limit alone, bool, shape (N,)."""
     fallen: Tensor
     """Whether it ended by a fall, bool, shape (N,)."""
-    scores: Tensor
-    """See ``rewards.success_scores``, shape (N, 4)."""
+    cut: Tensor
+    """Whether it is cut by other than failure: by its time limit, or by a new command or a push before the next step,
+    which are noise to who learns (docs/experiments.md, 14); bool, shape (N,)."""
+    flags: Tensor
+    """Whether any of ``dones``, of ``cut``, and of the commands whose time is up, bool, shape (3,)."""
     log_rows: Tensor
     """See ``StepLog.rows``."""
     command: Tensor
@@ -168,9 +171,14 @@ class ControlStep:
         self.ground.judge(scores[:, 0], state)
         errors, match = self.tracking_errors(), contact_match(state, task.gait)
         log_rows = self.step_log.rows(terms, reasons, causes, errors, match, dones & ~time_outs, dones, state.standing)
+        self.commands.judge(scores)
+        due = self.commands.due()
+        surprised = due | self.randomizer.pushes_at(self._step_count, self.step_dt)
+        cut = time_outs | (surprised & ~dones)
+        flags = torch.stack([where.any() for where in (dones, cut, due)])
         self._observe()
         rewards = rewards.masked_fill(sick, 0.0).float()
-        return Judgement(rewards, dones, time_outs, fallen, scores, log_rows, *self._derive_groups())
+        return Judgement(rewards, dones, time_outs, fallen, cut, flags, log_rows, *self._derive_groups())
 
     def _derive_groups(self) -> DerivedGroups:
         """The observation groups that are worked out from the present state."""
@@ -224,6 +232,7 @@ _STATE = (
 )
 """What ``HumanoidEnv.state`` is made of."""
 _ACTIONS = ("_actions", "_last_actions", "_last_last_actions")
+_FOLLOWED = ("commands.age", "commands.sampler.sums")
 _PARTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "_aim": (
         (*_STATE, "randomizer.motor_offset", "_live", "_harness"),
@@ -233,9 +242,9 @@ _PARTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         (
             *_STATE,
             *("_causes", "episode_length_buf", "_last_frame", "history.frames", "randomizer.latency", "embodiment"),
-            *("_step_count", "_noise", "_noise_keys", "_gait_shaping", "_reward_factors"),
+            *("_step_count", "_noise", "_noise_keys", "_gait_shaping", "_reward_factors", *_FOLLOWED),
         ),
-        ("episode_length_buf", "phase", "_last_frame", "history.frames"),
+        ("episode_length_buf", "phase", "_last_frame", "history.frames", *_FOLLOWED),
     ),
     "_derive_groups": ((*_STATE, "_last_frame", "embodiment"), ()),
     "_sense": (_STATE, ()),

@@ -174,17 +174,15 @@ class HumanoidEnv(ControlStep, VecEnv):
         self._forget()
         judged = self._judge()
         dones, time_outs, self._groups = judged.dones, judged.time_outs, judged.groups
-        self.commands.judge(judged.scores)
-
-        cut = dones if self.final_of_episodes else time_outs | (self._about_to_be_surprised() & ~dones)
-        final_ids = cut.nonzero().squeeze(1)
-        extras: dict[str, Any] = {"time_outs": time_outs, "final_ids": final_ids, "physics_time": self._physics_time}
-        extras["final_observations"] = self.get_observations()[final_ids] if len(final_ids) else self._no_observations
+        any_done, any_cut, any_due = judged.flags.tolist()
+        extras: dict[str, Any] = {"time_outs": time_outs, "physics_time": self._physics_time}
+        extras |= self._final(dones, any_done) if self.final_of_episodes else self._final(judged.cut, any_cut)
         extras["log"] = self._account(judged.log_rows)
-        reset_ids = dones.nonzero().squeeze(1)
-        if len(reset_ids):
+        if any_done:
+            reset_ids = dones.nonzero().squeeze(1)
             self._reset(reset_ids, judged.fallen[reset_ids])
-        self._resample()
+        if any_due:
+            self._resample()
         return self.get_observations(), judged.rewards, dones, extras
 
     def compile(self, from_step: int | None = None) -> None:
@@ -234,10 +232,12 @@ class HumanoidEnv(ControlStep, VecEnv):
 
     # --- parts of the step --------------------------------------------------------------------------------------------
 
-    def _about_to_be_surprised(self) -> Tensor:
-        """Where a new command or a push comes before the next step: noise to who learns (docs/experiments.md, 14)."""
-        due = self.commands.due()
-        return torch.ones_like(due) if self.randomizer.pushes_at(self.common_step_counter, self.step_dt) else due
+    def _final(self, where: Tensor, anywhere: bool) -> dict[str, Any]:
+        """The environments, bool (N,), whose returns end here, and what is observed there before anything is reset."""
+        if not anywhere:
+            return {"final_ids": self._all[:0], "final_observations": self._no_observations}
+        ids = where.nonzero().squeeze(1)
+        return {"final_ids": ids, "final_observations": self.get_observations()[ids]}
 
     def _weigh(self) -> Tensor:
         """Factor on each reward term in this step, shape (T, 1)."""
@@ -281,7 +281,7 @@ class HumanoidEnv(ControlStep, VecEnv):
         self.history.reset(ids, self._last_frame[ids])
 
     def _resample(self) -> None:
-        """Draw new commands where their time is up."""
+        """Draw new commands where their time is still up after resets."""
         ids = self.commands.due().nonzero().squeeze(1)
         if len(ids):
             self.commands.draw(ids)

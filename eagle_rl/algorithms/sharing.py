@@ -127,7 +127,7 @@ def _make_kernel(computation: Computation, parameters: Sequence[Tensor], example
         return list(computation.compute_at(at, share))
 
     inputs = [x.detach().clone() for x in (*parameters, *example.tensors.values())]
-    kernel = kernels.compile_graph(kernels.record(compute, inputs), inputs, by_threads=True)
+    kernel = kernels.compile_graph(kernels.record(compute, inputs), inputs)
 
     def replay(share: Share) -> Outcome:
         with torch.no_grad():

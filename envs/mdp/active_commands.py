@@ -40,6 +40,7 @@ class ActiveCommands:
         self._pinned = None if command is None else command.to(self.command, copy=True)
         if self._pinned is not None:
             self.command = self._pinned
+            self.sampler.spoil(slice(None))  # how it is followed is not how the sampled one was
 
     def draw(self, ids: Tensor) -> None:
         """Put the next commands of some environments in force, shape (n,)."""
@@ -58,10 +59,9 @@ class ActiveCommands:
             self.draw(ids[~fallen])
 
     def judge(self, scores: Tensor) -> None:
-        """Credit one step to the windows of the sampled commands, see ``rewards.success_scores``, shape (N, 4)."""
-        self.age += 1
-        if self._pinned is None:
-            self.sampler.accumulate(scores)
+        """Credit one step to the windows of the commands, see ``rewards.success_scores``, shape (N, 4)."""
+        self.age = self.age + 1
+        self.sampler.accumulate(scores)
 
     def due(self) -> Tensor:
         """Whether each environment's command has been in force for its time, bool, shape (N,)."""

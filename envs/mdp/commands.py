@@ -90,11 +90,12 @@ class CommandSampler:
         """Weight of each robot's bins, float64, shape (R, B)."""
         self._bin = torch.zeros(num_envs, dtype=torch.int64, device=device)
         self._creditable = torch.zeros(num_envs, dtype=torch.bool, device=device)
-        self._sums = torch.zeros(num_envs, 4, dtype=torch.float64, device=device)
+        self.sums = torch.zeros(num_envs, 4, dtype=torch.float64, device=device)
+        """Success quantities of the open windows, summed over their steps, shape (N, 4)."""
 
     def accumulate(self, scores: Tensor) -> None:
         """Add one step's success quantities, each 1 at best, shape (N, 4) (see ``rewards.success_scores``)."""
-        self._sums += scores
+        self.sums = self.sums + scores
 
     def sample(self, ids: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
         """Close the windows of some environments and draw their next commands.
@@ -115,11 +116,11 @@ class CommandSampler:
         command[:, 3:] = command[:, 3:].masked_fill(upright.unsqueeze(1), 0.0)
         self._bin[ids] = bins
         self._creditable[ids] = ~zeroed
-        self._sums[ids] = 0.0
+        self.sums[ids] = 0.0
         return command.to(torch.float32), (command[:, :3] == 0.0).all(dim=1)
 
-    def spoil(self, ids: Tensor) -> None:
-        """Deny success to the open windows of some environments, shape (n,): they fell in them."""
+    def spoil(self, ids: Tensor | slice) -> None:
+        """Deny success to the open windows of some environments, shape (n,): they fell in them, say."""
         self._creditable[ids] = False
 
     def _draw(self, robot: Tensor, draws: Tensor) -> tuple[Tensor, Tensor]:
@@ -148,7 +149,7 @@ class CommandSampler:
         Means are over a whole window, so one cut short by a fall fails; windows with a zeroed velocity do not count.
         """
         curriculum = self.cfg.curriculum
-        mean = self._sums[ids] / self._window_steps
+        mean = self.sums[ids] / self._window_steps
         success = (mean > self._thresholds).all(dim=1) & self._creditable[ids]
         winners = ids[success]
         if winners.numel() == 0:
@@ -164,7 +165,7 @@ class CommandSampler:
             "weights": self.weights.clone(),
             "bin": self._bin.clone(),
             "creditable": self._creditable.clone(),
-            "sums": self._sums.clone(),
+            "sums": self.sums.clone(),
         }
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
@@ -172,7 +173,7 @@ class CommandSampler:
         self.weights = state["weights"].to(self.weights)
         self._bin = state["bin"].to(self._bin, copy=True)
         self._creditable = state["creditable"].to(self._creditable, copy=True)
-        self._sums = state["sums"].to(self._sums, copy=True)
+        self.sums = state["sums"].to(self.sums, copy=True)
 
     def log(self) -> dict[str, float]:
         """Share of the grid that is open, over all robots and for the slowest one, and how heavy it is."""

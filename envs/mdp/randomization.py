@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -20,6 +20,9 @@ from .bodies import draw_morphology, randomize_bodies, resized
 NOMINAL_FRICTION = 1.0
 SPAWN_CLEARANCE = 0.04
 """Height above the default pose at which a robot is spawned [m] (HugWBC 2)."""
+
+
+Step = TypeVar("Step", int, Tensor)
 
 
 class Randomizer:
@@ -96,8 +99,8 @@ class Randomizer:
         numbers = self._rng.uniform(stream, count, sum(widths), ids).to(self.friction.dtype)
         return [low + (high - low) * u for ((low, high), _), u in zip(rows, numbers.split(widths, dim=1), strict=True)]
 
-    def pushes_at(self, step: int, step_dt: float) -> bool:
-        """Whether the environments are pushed at the start of a control step."""
+    def pushes_at(self, step: Step, step_dt: float) -> Step | bool:
+        """Whether the environments are pushed at the start of a control step; a tensor if ``step`` is one."""
         interval = round(self.cfg.push_interval_s / step_dt)
         return self.cfg.enabled and interval > 0 and step % interval == interval - 1
 

@@ -192,7 +192,7 @@ MUTANTS: tuple[Mutant, ...] = (
     Mutant(GAUSSIAN, "(old_std / std).square()", "(std / old_std).square()", "learner/test_distribution.py"),
     Mutant("eagle_rl/algorithms/valuing.py", "gamma * value", "value", LEARNER_TESTS),
     Mutant(PPO, "dones = dones.index_fill(0, ids, 1)", "dones = dones.clone()", LEARNER_TESTS),
-    Mutant(ENV, "time_outs | (self._about_to_be_surprised() & ~dones)", "time_outs", "envs/test_humanoid_env.py"),
+    Mutant(CONTROL_STEP, "time_outs | (surprised & ~dones)", "time_outs", "envs/test_humanoid_env.py"),
     Mutant(
         PPO, "self.learning_rate / LEARNING_RATE_FACTOR", "self.learning_rate * LEARNING_RATE_FACTOR", LEARNER_TESTS
     ),
