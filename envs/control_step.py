@@ -52,7 +52,7 @@ class Judgement(NamedTuple):
     """Whether it is cut by other than failure: by its time limit, or by a new command or a push before the next step,
     which are noise to who learns (docs/experiments.md, 14); bool, shape (N,)."""
     flags: Tensor
-    """Whether any of ``dones``, of ``cut``, and of the commands whose time is up, bool, shape (3,)."""
+    """Whether any of ``dones``, of ``cut``, of the commands whose time is up, of the sick, bool, shape (4,)."""
     log_rows: Tensor
     """See ``StepLog.rows``."""
     command: Tensor
@@ -98,8 +98,6 @@ class ControlStep:
     history: History
     episode_length_buf: Tensor
     phase: Tensor
-    _staged: Tensor
-    _causes: Tensor
     _live: Tensor
     _step_count: Tensor
     _harness: Tensor | None
@@ -139,9 +137,9 @@ class ControlStep:
     # --- parts of a step ----------------------------------------------------------------------------------------------
 
     def _aim(self, actions: Tensor) -> tuple[Tensor, Tensor | None]:
-        """PD targets, see :meth:`_act`, and the harness' wrench on the bases, (N, 6), or None without a harness."""
+        """Native PD targets, (N, most joints), and the harness' wrench on the bases, (N, 6), or None without one."""
         self._last_joint_vel, self._last_contact = self.state.joint_vel, self.state.foot_contact
-        targets = self._act(actions)
+        targets = self.pool.aim(self._act(actions))
         return targets, None if self._harness is None else harness_wrench(self.state, self.robots, self._harness)
 
     def _act(self, actions: Tensor) -> Tensor:
@@ -155,10 +153,11 @@ class ControlStep:
         return (targets + self.randomizer.motor_offset).masked_fill(absurd, torch.nan)
 
     def _judge(self) -> Judgement:
-        """Derive the new state, see what came of the step and what is sensed of it."""
+        """Stage what physics wrote, derive the new state, see what came of the step and what is sensed of it."""
+        self.pool.stage()
         self.episode_length_buf = self.episode_length_buf + 1
         self.phase = advance_phase(self.phase, self.step_dt, self.robots.gait_frequency)
-        state, task, robots, causes = self.state, self.task, self.robots, self._causes
+        state, task, robots, causes = self.state, self.task, self.robots, self.pool.causes
         sick = causes > 0
         reasons = terminations(state, task.terminations)
         fallen = torch.stack(list(reasons.values())).any(dim=0) & ~sick
@@ -175,7 +174,7 @@ class ControlStep:
         due = self.commands.due()
         surprised = due | self.randomizer.pushes_at(self._step_count, self.step_dt)
         cut = time_outs | (surprised & ~dones)
-        flags = torch.stack([where.any() for where in (dones, cut, due)])
+        flags = torch.stack([where.any() for where in (dones, cut, due, sick)])
         self._observe()
         rewards = rewards.masked_fill(sick, 0.0).float()
         return Judgement(rewards, dones, time_outs, fallen, cut, flags, log_rows, *self._derive_groups())
@@ -206,7 +205,7 @@ class ControlStep:
 
     def _derive(self) -> PooledState:
         """Turn the staging rows into the pooled state, with the command, phase and actions now in force."""
-        physical, standing = measured(self._staged, self.pool.columns), self.commands.standing
+        physical, standing = measured(self.pool.staged, self.pool.columns), self.commands.standing
         return PooledState(
             **physical,
             **self.ground.measure(physical["root_pos_w"], physical["root_quat_w"], physical["foot_pos_w"]),
@@ -227,7 +226,7 @@ class ControlStep:
 
 
 _STATE = (
-    *("_staged", "_last_joint_vel", "_last_contact", "_actions", "_last_actions", "_last_last_actions", "phase"),
+    *("pool.staged", "_last_joint_vel", "_last_contact", "_actions", "_last_actions", "_last_last_actions", "phase"),
     *("commands.command", "randomizer.friction", "robots"),
 )
 """What ``HumanoidEnv.state`` is made of."""
@@ -235,16 +234,20 @@ _ACTIONS = ("_actions", "_last_actions", "_last_last_actions")
 _FOLLOWED = ("commands.age", "commands.sampler.sums")
 _PARTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "_aim": (
-        (*_STATE, "randomizer.motor_offset", "_live", "_harness"),
-        (*_ACTIONS, "_last_joint_vel", "_last_contact"),
+        (*_STATE, "randomizer.motor_offset", "_live", "_harness", "pool.conventions"),
+        (*_ACTIONS, "_last_joint_vel", "_last_contact", "pool.wild"),
     ),
     "_judge": (
         (
             *_STATE,
-            *("_causes", "episode_length_buf", "_last_frame", "history.frames", "randomizer.latency", "embodiment"),
+            *("pool.native", "pool.conventions", "pool.clock", "pool.wild"),
+            *("episode_length_buf", "_last_frame", "history.frames", "randomizer.latency", "embodiment"),
             *("_step_count", "_noise", "_noise_keys", "_gait_shaping", "_reward_factors", *_FOLLOWED),
         ),
-        ("episode_length_buf", "phase", "_last_frame", "history.frames", *_FOLLOWED),
+        (
+            *("pool.staged", "pool.causes", "pool.clock", "episode_length_buf", "phase", "_last_frame"),
+            *("history.frames", *_FOLLOWED),
+        ),
     ),
     "_derive_groups": ((*_STATE, "_last_frame", "embodiment"), ()),
     "_sense": (_STATE, ()),

@@ -139,7 +139,6 @@ class HumanoidEnv(ControlStep, VecEnv):
         zeros = torch.zeros(n, NUM_SLOTS, dtype=dtype, device=device)
         self._actions = self._last_actions = self._last_last_actions = self._last_joint_vel = zeros
         self._last_contact = torch.zeros(n, 2, dtype=torch.bool, device=device)
-        self._staged, self._causes = self.pool.staged(), self.pool.causes()
         self._reward_factors = self._weigh()
         self._compile_at: int | None = None
         self._forget()
@@ -169,12 +168,13 @@ class HumanoidEnv(ControlStep, VecEnv):
         self._physics_step(*self._aim(actions))
         self.common_step_counter += 1
         self._step_count.fill_(self.common_step_counter)
-        self._causes = self.pool.causes()
         self._reward_factors = self._weigh()
         self._forget()
         judged = self._judge()
         dones, time_outs, self._groups = judged.dones, judged.time_outs, judged.groups
-        any_done, any_cut, any_due = judged.flags.tolist()
+        any_done, any_cut, any_due, any_sick = judged.flags.tolist()
+        if any_sick:
+            self.pool.keep_faults()
         extras: dict[str, Any] = {"time_outs": time_outs, "physics_time": self._physics_time}
         extras |= self._final(dones, any_done) if self.final_of_episodes else self._final(judged.cut, any_cut)
         extras["log"] = self._account(judged.log_rows)
@@ -247,7 +247,7 @@ class HumanoidEnv(ControlStep, VecEnv):
         """Push, help and step every robot."""
         self.randomizer.push(self.common_step_counter, self.penalty_scale, self.step_dt)
         start = time.perf_counter()
-        self._staged = self.pool.step(targets, wrench)
+        self.pool.advance(targets, wrench)
         self._physics_time = time.perf_counter() - start
 
     def _apply_aids(self) -> None:
@@ -275,7 +275,6 @@ class HumanoidEnv(ControlStep, VecEnv):
         for name in ("_actions", "_last_actions", "_last_last_actions", "_last_contact"):
             setattr(self, name, getattr(self, name).index_fill(0, ids, 0))
         self._last_joint_vel = self._last_joint_vel.index_copy(0, ids, staged[:, self.pool.columns["joint_vel"]])
-        self._staged = self._staged.index_copy(0, ids, staged)
         self._forget()
         (self._last_frame,) = self._sense()
         self.history.reset(ids, self._last_frame[ids])
@@ -328,5 +327,4 @@ class HumanoidEnv(ControlStep, VecEnv):
         for name in self._PARTS:
             getattr(self, name).load_state_dict(state[name])
         self._apply_aids()
-        self._staged = self.pool.staged()
         self._forget()

@@ -74,7 +74,7 @@ class RobotBatch:
 
         Args:
             targets: PD targets [rad], shape (n, joints).
-            aimed: whether a simulation takes them or keeps those it has, shape (n, 1).
+            aimed: whether a simulation takes them or keeps those it has, bool, shape (n, 1), or True for all.
         """
         np.copyto(self.ctrl, targets, where=aimed)
         self.advance()

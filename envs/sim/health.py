@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import mujoco
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from ..robots.spec import Array
 from .columns import staging_columns
@@ -33,11 +35,9 @@ MAX_ACTION = 1e6
 """[-]; smaller actions are clipped, larger ones come from a policy that has come apart."""
 
 _COLUMNS = staging_columns(num_sensors=0)
-_VELOCITIES = np.r_[_COLUMNS["root_lin_vel_w"], _COLUMNS["base_ang_vel_b"], _COLUMNS["joint_vel"]]
-_BOUNDS = np.full(_COLUMNS["joint_vel"].stop, np.finfo(np.float64).max)
-"""Largest magnitude of each position and velocity in a staging row, shape (77,)."""
-_BOUNDS[_COLUMNS["root_pos"]] = (MAX_DISTANCE, MAX_DISTANCE, MAX_HEIGHT)
-_BOUNDS[_VELOCITIES] = MAX_SPEED
+_MOVED = slice(_COLUMNS["root_pos"].start, _COLUMNS["joint_vel"].stop)
+"""Positions and velocities."""
+_VELOCITIES = (slice(_COLUMNS["root_lin_vel_w"].start, _COLUMNS["base_ang_vel_b"].stop), _COLUMNS["joint_vel"])
 _CODE = {cause: code for code, cause in enumerate(CAUSES, start=1)}
 
 
@@ -48,34 +48,33 @@ def _ignore(message: str) -> None:
 mujoco.set_mju_user_warning(_ignore)
 
 
-def diagnose(
-    rows: Array, advanced: NDArray[np.bool_], warned: NDArray[np.bool_], wild: NDArray[np.bool_]
-) -> NDArray[np.int64]:
+def diagnose(rows: Tensor, advanced: Tensor, warned: Tensor, wild: Tensor) -> Tensor:
     """Judge environments after a control step.
 
     Args:
         rows: staging rows in double precision, of which positions and velocities count, shape (n, 77 or more).
-        advanced: whether the clock advanced, shape (n,).
-        warned: whether MuJoCo warned or refused, shape (n,).
-        wild: whether the action was absurd, shape (n,).
+        advanced: whether the clock advanced, bool, shape (n,).
+        warned: whether MuJoCo warned or refused, bool, shape (n,).
+        wild: whether the action was absurd, bool, shape (n,).
 
     Returns:
-        Code of the first cause that applies (``action`` before the others, then in order), 0 if none; shape (n,).
+        Code of the first cause that applies (``action`` before the others, then in order), 0 if none; int64, (n,).
     """
-    moved = rows[:, : len(_BOUNDS)]
-    bounded = np.abs(moved) <= _BOUNDS  # nothing is, that is not finite
-    if advanced.all() and not (warned | wild).any() and bounded.all():
-        return np.zeros(len(rows), dtype=np.int64)
+    size = rows[:, _MOVED].abs()
+    speed = torch.stack([size[:, columns].amax(dim=1) for columns in _VELOCITIES]).amax(dim=0)
     signs = {
         "action": wild,
-        "non_finite": ~np.isfinite(moved).all(axis=1),
-        "velocity": ~bounded[:, _VELOCITIES].all(axis=1),
-        "height": ~bounded[:, 2],
-        "distance": ~bounded[:, :3].all(axis=1),
+        "non_finite": ~(size.amax(dim=1) <= torch.finfo(rows.dtype).max),  # nothing is, that is not a number
+        "velocity": speed > MAX_SPEED,
+        "height": size[:, 2] > MAX_HEIGHT,
+        "distance": size[:, :2].amax(dim=1) > MAX_DISTANCE,
         "time": ~advanced,
         "solver": warned,
     }
-    return np.select(list(signs.values()), [_CODE[cause] for cause in signs], 0)
+    codes = torch.zeros_like(wild, dtype=torch.long)
+    for cause, applies in reversed(signs.items()):
+        codes = codes.masked_fill(applies, _CODE[cause])
+    return codes
 
 
 class FlightRecorder:
@@ -83,9 +82,10 @@ class FlightRecorder:
 
     LENGTH = 8
 
-    def __init__(self, num_envs: int, width: int) -> None:
-        """Start empty."""
-        self._rows = np.zeros((self.LENGTH, num_envs, width))
+    def __init__(self, num_envs: int, width: int, pin_memory: bool = False) -> None:
+        """Start empty; memory from which a GPU reads is pinned."""
+        self._tensors = torch.zeros(self.LENGTH, num_envs, width, dtype=torch.float64, pin_memory=pin_memory)
+        self._rows: Array = self._tensors.numpy()
         self._age = np.zeros(num_envs, dtype=np.int64)
         self._latest = 0
 
@@ -93,6 +93,11 @@ class FlightRecorder:
     def latest(self) -> Array:
         """Rows as they are now, shape (num_envs, width)."""
         return self._rows[self._latest]
+
+    @property
+    def tensor(self) -> Tensor:
+        """The same rows, in the same memory."""
+        return self._tensors[self._latest]
 
     def next(self) -> Array:
         """Rows to be written in a new step: the oldest, which they replace, shape (num_envs, width)."""

@@ -1,4 +1,8 @@
-"""Several robots' simulations as one pool: every robot's state is written once into shared rows in slot space."""
+"""Several robots' simulations as one pool: every robot's state is written once into shared rows in slot space.
+
+A step has two parts: :meth:`PhysicsPool.advance`, which is physics, and :meth:`PhysicsPool.stage`, which is arithmetic
+on tensors and may be part of a kernel (``envs.control_step``).
+"""
 
 from __future__ import annotations
 
@@ -11,17 +15,16 @@ from typing import Any
 import mujoco
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from eagle_rl.machine import usable_cores
 from eagle_rl.threads import Threads
 
 from ..pooling import share
-from ..robots.spec import Array, RobotSpec
+from ..robots.spec import RobotSpec
 from .batch import Ids, RobotBatch
 from .health import CAUSES, FlightRecorder, diagnose
-from .staging import Staging
+from .staging import Staging, native_targets
 
 BATCHES_PER_THREAD = 4
 """So many parts is the pool cut into for each thread, so that none is long alone with the last."""
@@ -33,7 +36,7 @@ Simulated = tuple[RobotSpec, mujoco.MjModel, int]
 
 
 class PhysicsPool:
-    """Steps every robot and gathers their states into one array, copied to the learner's device once per step.
+    """Steps every robot and gathers their states into one tensor, on the learner's device.
 
     A robot's simulations are shared out among batches, which threads step side by side. Simulations have nothing in
     common, so results do not depend on the number of threads; what is saved is sorted by robots and does not either.
@@ -53,7 +56,7 @@ class PhysicsPool:
             robots: what is simulated.
             decimation: physics steps per control step.
             device: the learner's.
-            dtype: of the staging array.
+            dtype: of the staging rows.
             num_threads: physics threads, 0 for one per core.
         """
         self.threads = Threads(num_threads or usable_cores(), "physics")
@@ -70,14 +73,21 @@ class PhysicsPool:
         self.fault_folder: Path | None = None
         """Where the last states of sick environments are kept; None keeps none."""
         self._layout = Staging(self.batches)
+        self.conventions = self._layout.conventions(self.batches, device)
         self.columns = self._layout.columns
-        self._recorder = FlightRecorder(self.num_envs, self._layout.width)
-        self._causes = np.zeros(self.num_envs, dtype=np.int64)
-        width = self.columns["sensors"].stop
-        self._staging = torch.zeros(self.num_envs, width, dtype=dtype, pin_memory=device.type == "cuda")
-        self._array = self._staging.numpy()
+        self._recorder = FlightRecorder(self.num_envs, self._layout.width, pin_memory=device.type == "cuda")
         self._read()
-        self._array[:] = self._layout.rows(self._recorder.latest)
+        self.native = self._recorder.tensor.to(device)
+        """What MuJoCo wrote in the last step, robot by robot, shape (N, columns of the widest)."""
+        self.wild = torch.zeros(self.num_envs, dtype=torch.bool, device=device)
+        """Whether the last action was absurd, shape (N,); see :meth:`aim`."""
+        self.clock = torch.zeros(self.num_envs, dtype=torch.float64, device=device)
+        """Of each simulation after the last step [s], shape (N,)."""
+        self.causes = torch.zeros(self.num_envs, dtype=torch.long, device=device)
+        """What went wrong with each environment in the last step, 0 for nothing, shape (N,); see ``CAUSES``."""
+        self.staged = self._layout.rows(self.native, self.conventions).to(dtype)
+        """Staging rows, see :func:`staging_columns`, shape (N, columns); a new tensor at each step. Rows of sick
+        environments stay as they were in the step before, so that nothing that is not finite gets out."""
 
     def step(self, targets: Tensor, wrench: Tensor | None = None) -> Tensor:
         """Advance one control step.
@@ -87,33 +97,42 @@ class PhysicsPool:
             wrench: world-frame force [N] and torque [N m] on the bases, shape (N, 6), or None for none.
 
         Returns:
-            The staging array on the learner's device, see :func:`staging_columns`, shape (N, columns); fresh. Rows of
-            sick environments stay as they were in the step before, so that nothing that is not finite gets out.
+            ``staged``.
         """
-        native = self._layout.native_targets(targets.to("cpu", torch.float64).numpy())
+        self.advance(self.aim(targets), wrench)
+        self.stage()
+        return self.staged
+
+    def aim(self, targets: Tensor) -> Tensor:
+        """Canonical PD targets, see :meth:`step`, as native ones; remembers which of them are no numbers."""
+        native = native_targets(targets, self.conventions)
+        self.wild = ~native.sum(dim=1).isfinite()
+        return native
+
+    def advance(self, targets: Tensor, wrench: Tensor | None = None) -> None:
+        """Nothing but physics, under what :meth:`aim` returned; :meth:`stage` follows."""
+        native = targets.cpu().numpy()
         forces = None if wrench is None else wrench.to("cpu", torch.float64).numpy()
-        wild = ~np.isfinite(native.sum(axis=1))
-        aimed = ~wild[:, None]
-        before, after = self._recorder.latest, self._recorder.next()
+        aimed = ~self.wild.cpu().numpy()[:, None] if self.wild.any() else None
+        after = self._recorder.next()
 
         def advance(part: int) -> None:
             batch, rows = self.batches[part], self.rows[part]
             if forces is not None:
                 batch.apply_base_wrench(forces[rows])
-            batch.step(native[rows, : batch.spec.num_joints], aimed[rows])
+            batch.step(native[rows, : batch.spec.num_joints], True if aimed is None else aimed[rows])
             batch.read(after[rows])
 
         self.threads.share_out(advance, range(len(self.batches)))
-        self._stage(before, after, wild)
-        if self.fault_folder is not None and self._causes.any():
-            self._keep_faults(self.fault_folder)
-        return self.staged()
+        self.native = self._recorder.tensor.to(self.device, non_blocking=True)
 
-    def staged(self) -> Tensor:
-        """A fresh copy of the staging array on the learner's device."""
-        if self.device.type == "cpu":
-            return self._staging.clone()
-        return self._staging.to(self.device, non_blocking=True)
+    def stage(self) -> None:
+        """Judge what MuJoCo wrote in a step, and stage the rows of those who are well."""
+        rows, time = self._layout.rows(self.native, self.conventions), self.native[:, self._layout.time]
+        warned = (self.native[:, self._layout.alarms] != 0).any(dim=1)
+        self.causes = diagnose(rows, time > self.clock, warned, self.wild)
+        self.clock = time.clone()
+        self.staged = torch.where(self.causes.unsqueeze(1) > 0, self.staged, rows.to(self.staged.dtype))
 
     def split(self, ids: Tensor) -> list[tuple[int, Ids, Ids]]:
         """Split sorted pool rows by batch: (batch's index, rows local to it, positions in ``ids``)."""
@@ -142,10 +161,12 @@ class PhysicsPool:
             qvel = np.concatenate([root_[at, 7:], spec.signs * vel[at][:, spec.slots]], axis=1)
             batch.reset(local, qpos, qvel)
             batch.read(self._recorder.latest[self.rows[part]], local)
-        rows = ids.cpu().numpy()
-        self._recorder.forget(rows)
-        self._array[rows] = self._layout.rows(self._recorder.latest, rows)
-        return self._staging[ids.cpu()].to(self.device)
+        self._recorder.forget(ids.cpu().numpy())
+        native = self._recorder.tensor[ids.cpu()].to(self.device)
+        rows = self._layout.rows(native, self.conventions.rows(ids)).to(self.staged.dtype)
+        self.staged = self.staged.index_copy(0, ids, rows)
+        self.clock = self.clock.index_fill(0, ids, 0.0)
+        return rows
 
     def push(self, ids: Tensor, lin_vel_w: Tensor, ang_vel_b: Tensor) -> None:
         """Add velocity to the bases of some environments before the next step, shape (n, 3) each."""
@@ -172,19 +193,16 @@ class PhysicsPool:
             spec = self.batches[part].spec
             damping_ = spec.damping * kd[at][:, spec.slots]
             self.batches[part].set_gains(local, spec.stiffness * kp[at][:, spec.slots], damping_)
-            self._layout.damping[self.rows[part]][local] = spec.to_slots(damping_)
-
-    def causes(self) -> Tensor:
-        """What went wrong with each environment in the last step, 0 for nothing, int64, shape (N,); see ``CAUSES``."""
-        return torch.from_numpy(self._causes).to(self.device)
+            slots = torch.from_numpy(spec.to_slots(damping_)).to(self.device)
+            self.conventions.damping[ids[at[0] : at[-1] + 1]] = slots
 
     def state_dict(self) -> dict[str, Any]:
-        """Physics states, robot by robot, and the staging array, which holds what the last substep left behind."""
+        """Physics states, robot by robot, and the staging rows, which hold what the last substep left behind."""
         return {
             "states": [
                 torch.from_numpy(np.concatenate([batch.state() for batch in batches])) for batches in self._of_robots
             ],
-            "staging": self._staging.clone(),
+            "staging": self.staged.cpu(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -194,25 +212,19 @@ class PhysicsPool:
                 batch.set_state(saved[batch.first_env : batch.first_env + batch.num_envs].numpy())
         self._read()
         self._recorder.forget(slice(None))
-        self._staging.copy_(state["staging"])
+        self.native = self._recorder.tensor.to(self.device)
+        self.clock = self.native[:, self._layout.time].clone()
+        self.staged = state["staging"].to(self.staged, copy=True)
 
-    def _stage(self, before: Array, after: Array, wild: NDArray[np.bool_]) -> None:
-        """Judge what MuJoCo wrote in a step and write the staging rows of those who are well."""
-        columns, rows = self.batches[0].columns, self._layout.rows(after)
-        alarms = after[:, columns["status"].start : columns["warning"].stop]
-        advanced = after[:, columns["time"].start] > before[:, columns["time"].start]
-        self._causes = diagnose(rows, advanced, np.logical_or.reduce(alarms, axis=1), wild)
-        if self._causes.any():
-            sick = self._causes > 0
-            rows[sick] = self._array[sick]
-        self._array[:] = rows
-
-    def _keep_faults(self, folder: Path) -> None:
-        """Write down what led to the present sicknesses, a file for each."""
-        for part, local, _ in self.split(torch.from_numpy(np.flatnonzero(self._causes))):
+    def keep_faults(self) -> None:
+        """Write down what led to the present sicknesses, a file for each, where there is a folder for them."""
+        if self.fault_folder is None:
+            return
+        causes = self.causes.cpu()
+        for part, local, _ in self.split(causes.nonzero().squeeze(1)):
             for env, row in zip(local, self.rows[part].start + local, strict=True):
-                cause = CAUSES[self._causes[row] - 1]
-                self.batches[part].fault(env, cause, self._recorder.last(row)).save(folder)
+                cause = CAUSES[causes[row] - 1]
+                self.batches[part].fault(env, cause, self._recorder.last(row)).save(self.fault_folder)
 
     def _read(self) -> None:
         """Take what MuJoCo wrote last for the latest."""

@@ -54,7 +54,7 @@ def test_bad_numbers_are_caught_in_the_same_step_and_nobody_else_changes(where: 
         spoil(spoiled, where, value)
     first = healthy.step(actions(5, STEPS))
     second = spoiled.step(bad_action(STEPS, value) if where == "action" else actions(5, STEPS))
-    causes = [CAUSES[c - 1] if c else None for c in spoiled.pool.causes().tolist()]
+    causes = [CAUSES[c - 1] if c else None for c in spoiled.pool.causes.tolist()]
     assert causes[SICK] in ({"action"} if where == "action" else {"non_finite", "velocity"})
     assert causes.count(None) == 4
     observations, rewards, dones, extras = second
@@ -69,7 +69,7 @@ def test_bad_numbers_are_caught_in_the_same_step_and_nobody_else_changes(where: 
         assert torch.equal(first[2][OTHERS], second[2][OTHERS]), "dones"
         assert all(torch.isfinite(x).all() for x in second[0].values())
         first, second = healthy.step(actions(5, step)), spoiled.step(actions(5, step))
-        assert not spoiled.pool.causes().any(), "redrawn, it is healthy again"
+        assert not spoiled.pool.causes.any(), "redrawn, it is healthy again"
 
 
 def test_absurd_actions_in_absent_slots_harm_nobody() -> None:
@@ -79,7 +79,7 @@ def test_absurd_actions_in_absent_slots_harm_nobody() -> None:
         command = actions(4, step)
         out = first.step(command)
         assert_same(out[0], second.step(command.masked_fill(absent, torch.nan))[0], "an absent slot was read")
-        assert not second.pool.causes().any()
+        assert not second.pool.causes.any()
 
 
 def test_a_clock_that_stands_still_is_noticed() -> None:
@@ -87,7 +87,7 @@ def test_a_clock_that_stands_still_is_noticed() -> None:
     env.step(actions(4, 0))
     env.pool.batches[0]._time[1] = -5.0
     _, rewards, dones, _ = env.step(actions(4, 1))
-    assert env.pool.causes().tolist() == [0, CAUSES.index("time") + 1, 0, 0]
+    assert env.pool.causes.tolist() == [0, CAUSES.index("time") + 1, 0, 0]
     assert dones.tolist() == [False, True, False, False]
     assert rewards[1] == 0.0
 
@@ -96,10 +96,10 @@ def test_solver_warnings_count() -> None:
     env = make_env()
     env.pool.batches[1]._batch.warning[0, 1, 1] = 1
     _, _, dones, _ = env.step(actions(4, 0))
-    assert env.pool.causes().tolist() == [0, 0, CAUSES.index("solver") + 1, 0]
+    assert env.pool.causes.tolist() == [0, 0, CAUSES.index("solver") + 1, 0]
     assert dones[2]
     env.step(actions(4, 1))
-    assert not env.pool.causes().any(), "the warning ends with the episode"
+    assert not env.pool.causes.any(), "the warning ends with the episode"
 
 
 @given(
@@ -114,9 +114,9 @@ def test_diagnosis_names_the_first_cause(
     qpos: list[float], qvel: float, moving: str, advanced: bool, warned: bool, wild: bool
 ) -> None:
     columns = staging_columns(num_sensors=0)
-    row = np.zeros((1, columns["sensors"].stop))
-    row[:, columns["root_pos"]], row[:, columns[moving].stop - 1] = qpos, qvel
-    code = diagnose(row, *(np.array([x]) for x in (advanced, warned, wild)))[0]
+    row = torch.zeros(1, columns["sensors"].stop, dtype=torch.float64)
+    row[:, columns["root_pos"]], row[:, columns[moving].stop - 1] = torch.tensor(qpos, dtype=row.dtype), qvel
+    code = int(diagnose(row, *(torch.tensor([x]) for x in (advanced, warned, wild)))[0])
     if wild:
         expected = "action"
     elif not np.isfinite([*qpos, qvel]).all():

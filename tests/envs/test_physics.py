@@ -113,8 +113,8 @@ def test_threads_side_by_side_give_the_same_bits_as_one(threads: int) -> None:
         wrench = torch.randn(27, 6, generator=generator, dtype=torch.float64)
         one, other = (pool.step(goal, wrench) for pool in pools)
         assert torch.equal(one, other), f"step {step}"
-        assert torch.equal(*(pool.causes() for pool in pools))
-        assert bool(pools[0].causes()[8]) == (step == 5)
+        assert torch.equal(*(pool.causes for pool in pools))
+        assert bool(pools[0].causes[8]) == (step == 5)
 
 
 def test_the_torque_is_that_of_the_gains_in_force() -> None:
@@ -149,9 +149,9 @@ def test_staged_rows_handed_out_are_not_written_again() -> None:
 
 def test_a_push_adds_velocity_to_the_bases_it_names() -> None:
     pool = make_pool("h1", "t1")
-    before = pool.staged()
+    before = pool.staged
     linear, angular = torch.tensor([[1.0, 2.0, 3.0]]), torch.tensor([[4.0, 5.0, 6.0]])
     pool.push(torch.tensor([2]), linear.double(), angular.double())
     assert pool.batches[1].qvel[0, :6].tolist() == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
     assert not pool.batches[0].qvel[:, :6].any()
-    assert torch.equal(before, pool.staged())
+    assert torch.equal(before, pool.staged)

@@ -172,7 +172,7 @@ def test_robots_start_on_a_patch_of_their_level_and_above_the_ground(kind: str) 
         assert (env.state.base_height - env.robots.nominal_height).abs().max() < 0.2
     for _ in rollout(env, 25, scale=0.0):
         pass
-    assert not env.pool.causes().any()
+    assert not env.pool.causes.any()
     standing = env.state.foot_height[env.state.foot_contact]
     assert len(standing) > 10
     assert standing.abs().median() < 0.01, "feet in contact are on the ground"

@@ -70,7 +70,7 @@ def test_the_sick_are_numbered_among_their_robot_s_environments(tmp_path: Path) 
     batch.qvel[local, 8] = np.nan
     seen = batch.qpos[local].copy()
     env.step(torch.zeros(NUM_ENVS, 32))
-    assert env.pool.causes().nonzero().tolist() == [[SICK]]
+    assert env.pool.causes.nonzero().tolist() == [[SICK]]
     (path,) = tmp_path.iterdir()
     fault = load_fault(path)
     assert (fault.robot, fault.cause, fault.env) == ("g1", CAUSES[0], SICK - PER_ROBOT)

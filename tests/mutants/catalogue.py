@@ -119,9 +119,9 @@ MUTANTS: tuple[Mutant, ...] = (
     ),
     Mutant(POOLING, "0.5 * ratio * (upper - lower)", "ratio * (upper - lower)", "envs/test_pooling.py"),
     Mutant(POOLING, "spec.effort_limit / spec.stiffness", "spec.stiffness / spec.effort_limit", "envs/test_pooling.py"),
-    Mutant(STAGING, '"joint_pos"]] -= self._zero', '"joint_pos"]] += self._zero', "envs/test_physics.py"),
-    Mutant(STAGING, '"joint_torque"]] -= self.damping', '"joint_torque"]] += self.damping', "envs/test_physics.py"),
-    Mutant(STAGING, "(self._target_slots) + self", "(self._target_slots) - self", "envs/test_physics.py"),
+    Mutant(STAGING, "position - conv", "position + conv", "envs/test_physics.py"),
+    Mutant(STAGING, "force - conv", "force + conv", "envs/test_physics.py"),
+    Mutant(STAGING, "* chosen + conv", "* chosen - conv", "envs/test_physics.py"),
     Mutant("envs/sim/batch.py", "env=self.first_env + env", "env=env", "envs/test_threads.py"),
     # observations
     Mutant(
