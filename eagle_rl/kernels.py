@@ -22,7 +22,7 @@ from eagle_rl.errors import CompileError
 Kernel = Callable[..., Sequence[Tensor]]
 """Takes tensors of just the shapes, types and strides it was made for."""
 
-_TRUSTING = {"size_asserts": False, "alignment_asserts": False}
+_TRUSTING = {"size_asserts": False, "alignment_asserts": False, "assert_indirect_indexing": False}
 """Whoever calls a kernel sees to it that its inputs are as promised; to check them takes a tenth of a small one."""
 
 

@@ -240,7 +240,7 @@ _PARTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "_judge": (
         (
             *_STATE,
-            *("pool.native", "pool.conventions", "pool.clock", "pool.wild"),
+            *("pool.native", "pool.conventions", "pool.damping", "pool.clock", "pool.wild"),
             *("episode_length_buf", "_last_frame", "history.frames", "randomizer.latency", "embodiment"),
             *("_step_count", "_noise", "_noise_keys", "_gait_shaping", "_reward_factors", *_FOLLOWED),
         ),

@@ -5,6 +5,8 @@ MuJoCo itself goes on with numbers that are not finite, and says so only in a co
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import mujoco
 import numpy as np
 import torch
@@ -12,7 +14,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..robots.spec import Array
-from .columns import staging_columns
 
 CAUSES = ("non_finite", "velocity", "height", "distance", "time", "solver", "action")
 """What can be wrong with an environment; code c stands for ``CAUSES[c - 1]`` and 0 for nothing:
@@ -34,11 +35,8 @@ MAX_DISTANCE = 1000.0
 MAX_ACTION = 1e6
 """[-]; smaller actions are clipped, larger ones come from a policy that has come apart."""
 
-_COLUMNS = staging_columns(num_sensors=0)
-_MOVED = slice(_COLUMNS["root_pos"].start, _COLUMNS["joint_vel"].stop)
-"""Positions and velocities."""
-_VELOCITIES = (slice(_COLUMNS["root_lin_vel_w"].start, _COLUMNS["base_ang_vel_b"].stop), _COLUMNS["joint_vel"])
 _CODE = {cause: code for code, cause in enumerate(CAUSES, start=1)}
+_NONE = len(CAUSES) + 1.0
 
 
 def _ignore(message: str) -> None:
@@ -48,33 +46,44 @@ def _ignore(message: str) -> None:
 mujoco.set_mju_user_warning(_ignore)
 
 
-def diagnose(rows: Tensor, advanced: Tensor, warned: Tensor, wild: Tensor) -> Tensor:
+def limits(columns: Mapping[str, slice], width: int) -> tuple[Array, Array]:
+    """What a robot's native rows, see ``RobotBatch.columns``, are judged by, shape (``width``,) each.
+
+    Returns:
+        Largest magnitude of each number of a simulation that is well, and the code of being beyond it.
+    """
+    largest, beyond = np.full(width, np.inf), np.zeros(width)
+
+    def limit(where: slice, magnitude: float | tuple[float, ...], *causes: str) -> None:
+        largest[where], beyond[where] = magnitude, [_CODE[cause] for cause in causes]
+
+    for alarm in ("status", "warning"):
+        limit(columns[alarm], 0.0, "solver")
+    qpos = columns["qpos"].start
+    limit(columns["qpos"], np.finfo(np.float64).max, "non_finite")
+    limit(slice(qpos, qpos + 3), (MAX_DISTANCE, MAX_DISTANCE, MAX_HEIGHT), "distance", "distance", "height")
+    limit(columns["qvel"], MAX_SPEED, "velocity")
+    return largest, beyond
+
+
+def diagnose(native: Tensor, largest: Tensor, beyond: Tensor, advanced: Tensor, wild: Tensor) -> Tensor:
     """Judge environments after a control step.
 
     Args:
-        rows: staging rows in double precision, of which positions and velocities count, shape (n, 77 or more).
+        native: what MuJoCo wrote of each, shape (n, columns).
+        largest: see :func:`limits`, shape (n, columns).
+        beyond: see :func:`limits`, shape (n, columns).
         advanced: whether the clock advanced, bool, shape (n,).
-        warned: whether MuJoCo warned or refused, bool, shape (n,).
         wild: whether the action was absurd, bool, shape (n,).
 
     Returns:
         Code of the first cause that applies (``action`` before the others, then in order), 0 if none; int64, (n,).
     """
-    size = rows[:, _MOVED].abs()
-    speed = torch.stack([size[:, columns].amax(dim=1) for columns in _VELOCITIES]).amax(dim=0)
-    signs = {
-        "action": wild,
-        "non_finite": ~(size.amax(dim=1) <= torch.finfo(rows.dtype).max),  # nothing is, that is not a number
-        "velocity": speed > MAX_SPEED,
-        "height": size[:, 2] > MAX_HEIGHT,
-        "distance": size[:, :2].amax(dim=1) > MAX_DISTANCE,
-        "time": ~advanced,
-        "solver": warned,
-    }
-    codes = torch.zeros_like(wild, dtype=torch.long)
-    for cause, applies in reversed(signs.items()):
-        codes = codes.masked_fill(applies, _CODE[cause])
-    return codes
+    size = native.abs()
+    beyond = torch.where(size <= torch.finfo(native.dtype).max, beyond, float(_CODE["non_finite"]))
+    code = torch.where(size <= largest, _NONE, beyond).amin(dim=1)  # what is not a number is not within any limits
+    code = torch.where(advanced, code, code.clamp(max=_CODE["time"]))
+    return torch.where(wild, _CODE["action"], torch.where(code < _NONE, code, 0.0).long())
 
 
 class FlightRecorder:

@@ -72,8 +72,8 @@ class PhysicsPool:
         self.device = device
         self.fault_folder: Path | None = None
         """Where the last states of sick environments are kept; None keeps none."""
-        self._layout = Staging(self.batches)
-        self.conventions = self._layout.conventions(self.batches, device)
+        self._layout = Staging(self.batches, dtype)
+        self.conventions = self._layout.conventions(self._of_robots, device)
         self.columns = self._layout.columns
         self._recorder = FlightRecorder(self.num_envs, self._layout.width, pin_memory=device.type == "cuda")
         self._read()
@@ -85,7 +85,10 @@ class PhysicsPool:
         """Of each simulation after the last step [s], shape (N,)."""
         self.causes = torch.zeros(self.num_envs, dtype=torch.long, device=device)
         """What went wrong with each environment in the last step, 0 for nothing, shape (N,); see ``CAUSES``."""
-        self.staged = self._layout.rows(self.native, self.conventions).to(dtype)
+        damping = [np.tile(batch.spec.to_slots(batch.spec.damping), (batch.num_envs, 1)) for batch in self.batches]
+        self.damping = torch.from_numpy(np.concatenate(damping)).to(device)
+        """kd in force, in slots [N m s/rad], shape (N, 32)."""
+        self.staged = self._rows(slice(None))
         """Staging rows, see :func:`staging_columns`, shape (N, columns); a new tensor at each step. Rows of sick
         environments stay as they were in the step before, so that nothing that is not finite gets out."""
 
@@ -128,11 +131,10 @@ class PhysicsPool:
 
     def stage(self) -> None:
         """Judge what MuJoCo wrote in a step, and stage the rows of those who are well."""
-        rows, time = self._layout.rows(self.native, self.conventions), self.native[:, self._layout.time]
-        warned = (self.native[:, self._layout.alarms] != 0).any(dim=1)
-        self.causes = diagnose(rows, time > self.clock, warned, self.wild)
+        time, robot, of = self.native[:, self._layout.time], self.conventions.robot, self.conventions
+        self.causes = diagnose(self.native, of.largest[robot], of.beyond[robot], time > self.clock, self.wild)
         self.clock = time.clone()
-        self.staged = torch.where(self.causes.unsqueeze(1) > 0, self.staged, rows.to(self.staged.dtype))
+        self.staged = torch.where(self.causes.unsqueeze(1) > 0, self.staged, self._rows(slice(None)))
 
     def split(self, ids: Tensor) -> list[tuple[int, Ids, Ids]]:
         """Split sorted pool rows by batch: (batch's index, rows local to it, positions in ``ids``)."""
@@ -162,8 +164,8 @@ class PhysicsPool:
             batch.reset(local, qpos, qvel)
             batch.read(self._recorder.latest[self.rows[part]], local)
         self._recorder.forget(ids.cpu().numpy())
-        native = self._recorder.tensor[ids.cpu()].to(self.device)
-        rows = self._layout.rows(native, self.conventions.rows(ids)).to(self.staged.dtype)
+        self.native = self._recorder.tensor.to(self.device)
+        rows = self._rows(ids)
         self.staged = self.staged.index_copy(0, ids, rows)
         self.clock = self.clock.index_fill(0, ids, 0.0)
         return rows
@@ -194,7 +196,7 @@ class PhysicsPool:
             damping_ = spec.damping * kd[at][:, spec.slots]
             self.batches[part].set_gains(local, spec.stiffness * kp[at][:, spec.slots], damping_)
             slots = torch.from_numpy(spec.to_slots(damping_)).to(self.device)
-            self.conventions.damping[ids[at[0] : at[-1] + 1]] = slots
+            self.damping[ids[at[0] : at[-1] + 1]] = slots
 
     def state_dict(self) -> dict[str, Any]:
         """Physics states, robot by robot, and the staging rows, which hold what the last substep left behind."""
@@ -225,6 +227,10 @@ class PhysicsPool:
             for env, row in zip(local, self.rows[part].start + local, strict=True):
                 cause = CAUSES[causes[row] - 1]
                 self.batches[part].fault(env, cause, self._recorder.last(row)).save(self.fault_folder)
+
+    def _rows(self, ids: Tensor | slice) -> Tensor:
+        """Staging rows of some environments as they are now."""
+        return self._layout.rows(self.native[ids], self.damping[ids], self.conventions.robot[ids], self.conventions)
 
     def _read(self) -> None:
         """Take what MuJoCo wrote last for the latest."""

@@ -120,7 +120,7 @@ MUTANTS: tuple[Mutant, ...] = (
     Mutant(POOLING, "0.5 * ratio * (upper - lower)", "ratio * (upper - lower)", "envs/test_pooling.py"),
     Mutant(POOLING, "spec.effort_limit / spec.stiffness", "spec.stiffness / spec.effort_limit", "envs/test_pooling.py"),
     Mutant(STAGING, "position - conv", "position + conv", "envs/test_physics.py"),
-    Mutant(STAGING, "force - conv", "force + conv", "envs/test_physics.py"),
+    Mutant(STAGING, "force - damping", "force + damping", "envs/test_physics.py"),
     Mutant(STAGING, "* chosen + conv", "* chosen - conv", "envs/test_physics.py"),
     Mutant("envs/sim/batch.py", "env=self.first_env + env", "env=env", "envs/test_threads.py"),
     # observations
