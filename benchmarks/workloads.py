@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -20,6 +21,8 @@ from envs.sim.batch import RobotBatch
 from .measure import Cost, in_turns
 
 SEED = 1
+_ACTIONS = 32
+"""Different actions under which an environment is stepped in turn."""
 
 
 def experiment(threads: int) -> ExperimentCfg:
@@ -47,6 +50,8 @@ class Stepping:
     def __init__(self, env: HumanoidEnv) -> None:
         """Step until the first falls are over."""
         self.env = env
+        actions = 0.3 * torch.randn(_ACTIONS, env.num_envs, env.num_actions)  # drawn by a policy, not by the step
+        self._actions = itertools.cycle(actions.unbind())
         with torch.inference_mode():
             for _ in range(25):
                 self.step()
@@ -54,7 +59,7 @@ class Stepping:
     def step(self) -> None:
         """One control step, with everything that belongs to it."""
         with torch.inference_mode():
-            self.env.step(0.3 * torch.randn(self.env.num_envs, self.env.num_actions))
+            self.env.step(next(self._actions))
 
 
 class BarePhysics:
