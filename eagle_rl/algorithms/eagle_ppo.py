@@ -120,6 +120,7 @@ class EaglePPO(PPO):
         """Sample actions, shape (N, 32), and keep what the update wants to know of them."""
         if self.num_updates >= self.compile_from:  # here, since a resumed run begins by acting
             self.acting.compile()
+            self.valuing.compile()
             self.gradient.compile()
         decision, step = self.acting(obs), self.transition
         step.hidden_states, step.observations = (None, None), obs

@@ -35,8 +35,7 @@ def graphs(monkeypatch: pytest.MonkeyPatch) -> list[fx.GraphModule]:
     """Replays what was recorded operation by operation, and tells what it was."""
     made: list[fx.GraphModule] = []
 
-    def as_it_is(graph: fx.GraphModule, inputs: list[Tensor], by_threads: bool = False) -> fx.GraphModule:
-        assert by_threads, "a kernel that keeps Python to itself makes the others wait"
+    def as_it_is(graph: fx.GraphModule, inputs: list[Tensor]) -> fx.GraphModule:
         made.append(graph)
         return graph
 
@@ -120,6 +119,27 @@ def test_a_share_is_worth_the_hand_over():
 
 
 @pytest.mark.usefixtures("worth_sharing")
+@pytest.mark.parametrize(("threads", "precision", "shares"), [(5, "float32", 5), (2, "float32", 1), (5, "bfloat16", 1)])
+def test_actions_are_shared_out_in_float32_where_rows_come_out_even(threads, precision, shares, monkeypatch):
+    runner = make_runner(env=ToyEnv(ENVS), precision=precision)
+    obs, decisions, counts = runner.env.get_observations(), [], []
+
+    def counting(do, tasks):
+        counts.append(len(tasks))
+        return share_out(do, tasks)
+
+    share_out = sharing.share_out
+    monkeypatch.setattr(sharing, "share_out", counting)
+    for count in (1, threads):
+        use_threads(count)
+        torch.manual_seed(0)
+        decisions.append(runner.alg.acting(obs))
+    assert counts == [1, shares]
+    for name, expected in vars(decisions[0]).items():
+        torch.testing.assert_close(getattr(decisions[1], name), expected, msg=f"{name} depends on who works it out")
+
+
+@pytest.mark.usefixtures("worth_sharing")
 def test_a_repetition_has_the_same_bits_whichever_thread_was_faster():
     use_threads(3)
     ends = []
@@ -166,7 +186,7 @@ def test_kernels_do_what_the_code_does_at_every_value_of_the_parameters(algo, me
         runner.alg.compile_from = compile_from
         runner.learn(2)
         ends.append(parameters(runner))
-    assert len(graphs) == 3, "one for acting, one for each share"
+    assert len(graphs) == 4, "one for acting, one for values, one for each share"
     require_alike(ends[1], ends[0], 0.02 if "precision" in algo else 1e-4)
 
 
@@ -188,7 +208,7 @@ def test_kernels_are_used_from_the_update_on_that_was_said(graphs):
     runner.alg.compile_from = 2
     made = []
     runner.learn(4, on_iteration=lambda _: made.append(len(graphs)))
-    assert made == [0, 0, 2, 2], "after two updates robots act and the policy learns by kernels"
+    assert made == [0, 0, 3, 3], "after two updates robots act and are valued and the policy learns by kernels"
 
 
 def test_without_a_compiler_a_run_goes_on_and_says_so_once(monkeypatch):
@@ -197,7 +217,7 @@ def test_without_a_compiler_a_run_goes_on_and_says_so_once(monkeypatch):
     runner.alg.compile_from = 1
     with pytest.warns(EagleWarning, match=r"no C\+\+ compiler.*goes on without") as warned:
         runner.learn(3)
-    assert len(warned) == 2, "one of learning, one of acting"
+    assert len(warned) == 3, "one of learning, one of acting, one of valuing"
     plain = make_runner()
     plain.learn(3)
     for name, x in parameters(plain).items():
