@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -12,6 +13,7 @@ from eagle_rl.config.schema import TaskCfg
 from .ground import Plane
 from .mdp.active_commands import ActiveCommands
 from .mdp.aids import harness_wrench
+from .mdp.commands import DrawnCommands
 from .mdp.gait import advance_phase, foot_phases
 from .mdp.layout import SENSED_SIZE
 from .mdp.metrics import contact_match, measured_commands, tracking_errors
@@ -25,16 +27,19 @@ from .mdp.observations import (
     proprioception,
 )
 from .mdp.posture import RestingPose
-from .mdp.randomization import Randomizer
+from .mdp.randomization import Draws, Randomizer
 from .mdp.rewards import RewardContext, compute_rewards, success_scores
 from .mdp.terminations import terminations
 from .measure import measured
-from .recording import Recording
+from .recording import InBlocks, Recording
 from .rng import CounterRng
 from .sim.health import MAX_ACTION
 from .sim.pool import PhysicsPool
 from .state import PooledRobots, PooledState
 from .step_log import StepLog
+
+BLOCK = 8
+"""Environments whose new episodes a kernel draws at a time; more at once are drawn without."""
 
 
 class Judgement(NamedTuple):
@@ -75,6 +80,36 @@ class DerivedGroups(NamedTuple):
     estimate: Tensor
 
 
+class Episode(NamedTuple):
+    """What is drawn for the beginning of an episode, a row for each of some environments."""
+
+    root: Tensor
+    """See ``Randomizer.initial_state``, shape (n, 13)."""
+    joint_pos: Tensor
+    joint_vel: Tensor
+    command: Tensor
+    """What follows are the fields of ``DrawnCommands``."""
+    bins: Tensor
+    creditable: Tensor
+    friction: Tensor | None = None
+    """What follows are the fields of ``Draws``, if anything is randomized."""
+    motor_offset: Tensor | None = None
+    latency: Tensor | None = None
+    stiffness_scale: Tensor | None = None
+    damping_scale: Tensor | None = None
+
+    @property
+    def commands(self) -> DrawnCommands:
+        """The commands."""
+        return DrawnCommands(self.command, self.bins, self.creditable)
+
+    @property
+    def draws(self) -> Draws | None:
+        """What is randomized."""
+        draws = (self.friction, self.motor_offset, self.latency, self.stiffness_scale, self.damping_scale)
+        return None if self.friction is None else Draws(*draws)  # type: ignore[arg-type]
+
+
 class ControlStep:
     """What a control step does besides physics, all of it arithmetic on tensors of the pool.
 
@@ -96,6 +131,7 @@ class ControlStep:
     step_log: StepLog
     embodiment: Tensor | None
     history: History
+    episode_count: Tensor
     episode_length_buf: Tensor
     phase: Tensor
     _live: Tensor
@@ -189,6 +225,18 @@ class ControlStep:
             estimation_target(state, self.embodiment, cfg).float(),
         )
 
+    def _look(self) -> DerivedGroups:
+        """Observe robots that a reset has moved: their frame and the groups."""
+        (self._last_frame,) = self._sense()
+        return self._derive_groups()
+
+    def _begin(self, ids: Tensor) -> Episode:
+        """Draw how new episodes of some environments, shape (n,), begin; nothing changes."""
+        count = self.episode_count[ids]
+        drawn = self.commands.sampler.draw(ids, self.commands.count[ids])
+        draws = self.randomizer.draw(ids, count, self.step_dt)
+        return Episode(*self.randomizer.initial_state(ids, count), *drawn, *(draws or ()))
+
     def _sense(self) -> tuple[Tensor]:
         """The clean frame of the present state, (N, F)."""
         return (proprioception(self.state, self.robots, self.task.observations),)
@@ -250,7 +298,14 @@ _PARTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ),
     ),
     "_derive_groups": ((*_STATE, "_last_frame", "embodiment"), ()),
-    "_sense": (_STATE, ()),
+    "_look": ((*_STATE, "_last_frame", "embodiment"), ("_last_frame",)),
+    "_begin": (
+        (
+            *("randomizer.robots", "episode_count", "randomizer.reset_keys", "randomizer.start_keys"),
+            *("commands.count", "commands.sampler.keys", "commands.sampler.weights", "commands.sampler.robot_id"),
+        ),
+        (),
+    ),
 }
 """Parts of ``HumanoidEnv.step``: attributes that each reads and writes."""
 
@@ -268,6 +323,14 @@ def compile_step(env: ControlStep) -> None:
     for name, (reads, writes) in _PARTS.items():
         read, written = more.get(name, ((), ()))
         recording = Recording(env, getattr(env, name), (*reads, *read), (*writes, *written), ("_state",))
-        recording.make(*([torch.zeros_like(env._actions, dtype=torch.float32)] if name == "_aim" else []))
+        recording.make(*_EXAMPLES.get(name, lambda _: ())(env))
         recordings[name] = recording
-    vars(env).update(recordings)
+    begin = InBlocks(recordings["_begin"], env._begin, BLOCK)
+    vars(env).update(recordings | {"_begin": begin})
+
+
+_EXAMPLES: dict[str, Callable[[ControlStep], tuple[Tensor, ...]]] = {
+    "_aim": lambda env: (torch.zeros_like(env._actions, dtype=torch.float32),),
+    "_begin": lambda env: (torch.zeros(BLOCK, dtype=torch.long, device=env.device),),
+}
+"""Arguments of those parts that have some."""

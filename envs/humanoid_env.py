@@ -264,19 +264,21 @@ class HumanoidEnv(ControlStep, VecEnv):
         count = self.episode_count[ids]
         if self.ground.has_levels:
             self.ground.advance(ids, count, self.state, self.episode_length_buf)
-        self.randomizer.reset(ids, count, self.step_dt)
-        root, joint_pos, joint_vel = self.randomizer.initial_state(ids, count)
-        staged = self.pool.reset(ids, self.ground.place(ids, count, root), joint_pos, joint_vel)
+        self.commands.close(ids, fallen)
+        begun = self._begin(ids)
+        if begun.draws is not None:
+            self.randomizer.put(ids, begun.draws)
+        staged = self.pool.reset(ids, self.ground.place(ids, count, begun.root), begun.joint_pos, begun.joint_vel)
         self.episode_count[ids] += 1
         self.episode_length_buf = self.episode_length_buf.index_fill(0, ids, 0)
         self.phase = self.phase.index_fill(0, ids, 0.0)
-        self.commands.renew(ids, fallen)
+        self.commands.renew(ids, fallen, begun.commands)
         self.posture.reset(ids)
         for name in ("_actions", "_last_actions", "_last_last_actions", "_last_contact"):
             setattr(self, name, getattr(self, name).index_fill(0, ids, 0))
         self._last_joint_vel = self._last_joint_vel.index_copy(0, ids, staged[:, self.pool.columns["joint_vel"]])
         self._forget()
-        (self._last_frame,) = self._sense()
+        self._groups = self._look()
         self.history.reset(ids, self._last_frame[ids])
 
     def _resample(self) -> None:

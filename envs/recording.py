@@ -112,6 +112,27 @@ class Recording:
         return [replay.graph for replay in self._replays.values()]
 
 
+class InBlocks:
+    """Stands in for a method of any number of rows, up to a block at a time by its recording for just that number."""
+
+    def __init__(self, recording: Recording, method: Callable[[Tensor], Any], size: int) -> None:
+        """Use ``recording`` of ``method`` for up to ``size`` rows, whose results are tuples of tensors."""
+        self.graphs = recording.graphs
+        self._recording, self._method = recording, method
+        self._size = size
+        self._fill: dict[int, Tensor] = {}
+
+    def __call__(self, ids: Tensor) -> Any:
+        """Do what the method does."""
+        count = len(ids)
+        if count > self._size:
+            return self._method(ids)
+        if count not in self._fill:
+            self._fill[count] = torch.arange(self._size, device=ids.device).clamp(max=count - 1)
+        results = self._recording(ids[self._fill[count]])
+        return type(results)(*(None if x is None else x[:count] for x in results))
+
+
 class _Replay:
     """A kernel and the way tensors get into it and out."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .commands import CommandSampler
+from .commands import CommandSampler, DrawnCommands
 
 
 class ActiveCommands:
@@ -44,19 +44,34 @@ class ActiveCommands:
 
     def draw(self, ids: Tensor) -> None:
         """Put the next commands of some environments in force, shape (n,)."""
+        self.close(ids)
+        self._begin(ids, self.sampler.draw(ids, self.count[ids]))
+
+    def close(self, ids: Tensor, fallen: Tensor | None = None) -> None:
+        """End windows of some environments, shape (n,), before they draw; those that fell, bool (n,), have failed."""
+        if fallen is not None and not self.sampler.cfg.redraw_after_fall:
+            self.sampler.spoil(ids[fallen])
+            ids = ids[~fallen]
+        if self._pinned is None:
+            self.sampler.close(ids)
+
+    def renew(self, ids: Tensor, fallen: Tensor, drawn: DrawnCommands) -> None:
+        """Begin new episodes, shape (n,), under what was drawn for them.
+
+        One that follows a fall, bool (n,), may have to finish the old command instead.
+        """
+        if self.sampler.cfg.redraw_after_fall:
+            self._begin(ids, drawn)
+        else:
+            self._begin(ids[~fallen], DrawnCommands(*(x[~fallen] for x in drawn)))
+
+    def _begin(self, ids: Tensor, drawn: DrawnCommands) -> None:
+        """Put commands in force, unless others are pinned."""
         self.age[ids] = 0
         if self._pinned is None:
-            command, _ = self.sampler.sample(ids, self.count[ids])
+            self.sampler.open(ids, drawn)
             self.count[ids] += 1
-            self.command = self.command.index_copy(0, ids, command.to(self.command))
-
-    def renew(self, ids: Tensor, fallen: Tensor) -> None:
-        """Draw for new episodes, shape (n,); one that follows a fall, bool (n,), may have to finish the old command."""
-        if self.sampler.cfg.redraw_after_fall:
-            self.draw(ids)
-        else:
-            self.sampler.spoil(ids[fallen])
-            self.draw(ids[~fallen])
+            self.command = self.command.index_copy(0, ids, drawn.command.to(self.command))
 
     def judge(self, scores: Tensor) -> None:
         """Credit one step to the windows of the commands, see ``rewards.success_scores``, shape (N, 4)."""

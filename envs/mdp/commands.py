@@ -7,6 +7,7 @@ good tracking opens the bins around its own. Nothing is ever closed again.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -58,6 +59,17 @@ def _thresholds(cfg: CommandCurriculumCfg) -> list[float]:
     return [cfg.lin_vel_threshold, cfg.ang_vel_threshold, cfg.contact_force_threshold, cfg.contact_vel_threshold]
 
 
+class DrawnCommands(NamedTuple):
+    """What :meth:`CommandSampler.draw` draws."""
+
+    command: Tensor
+    """(v_x, v_y, omega, h, p), float32, shape (n, 5)."""
+    bins: Tensor
+    """Of the grid, int64, shape (n,)."""
+    creditable: Tensor
+    """Whether its window counts: no velocity was zeroed, bool, shape (n,)."""
+
+
 class CommandSampler:
     """Draws commands for environments and remembers how well each window was tracked."""
 
@@ -76,6 +88,8 @@ class CommandSampler:
         self.cfg = cfg
         self.robot_id = robots.robot_id
         self._rng = rng
+        self.keys = rng.keys(_STREAM)
+        """Of the random stream, shape (N,)."""
         self._grid = CommandGrid(cfg, robots.robot_id.device)
         others = (cfg.lin_vel_y, cfg.base_height, cfg.body_pitch)
         self._initial, self._finishing = (
@@ -107,17 +121,30 @@ class CommandSampler:
         Returns:
             Commands (v_x, v_y, omega, h, p), float32, shape (n, 5), and whether all velocities are zero, bool, (n,).
         """
-        if self.cfg.curriculum.enabled:
-            self._credit(ids)
-        draws = self._rng.uniform(_STREAM, count, 8, ids).to(torch.float64)
+        self.close(ids)
+        drawn = self.draw(ids, count)
+        self.open(ids, drawn)
+        return drawn.command, (drawn.command[:, :3] == 0.0).all(dim=1)
+
+    def draw(self, ids: Tensor, count: Tensor) -> DrawnCommands:
+        """Draw commands for some environments, shape (n,), that have drawn so often before, (n,); nothing changes."""
+        draws = self._rng.uniform(self.keys, count, 8, ids).to(torch.float64)
         command, bins = self._draw(self.robot_id[ids], draws)
         command, zeroed = self._zero_small(command, draws[:, 6] < self.cfg.standing_probability)
         upright = draws[:, 7] < self.cfg.upright_probability
         command[:, 3:] = command[:, 3:].masked_fill(upright.unsqueeze(1), 0.0)
-        self._bin[ids] = bins
-        self._creditable[ids] = ~zeroed
+        return DrawnCommands(command.to(torch.float32), bins, ~zeroed)
+
+    def close(self, ids: Tensor) -> None:
+        """Close the windows of some environments, shape (n,): what succeeded widens the grid."""
+        if self.cfg.curriculum.enabled:
+            self._credit(ids)
+
+    def open(self, ids: Tensor, drawn: DrawnCommands) -> None:
+        """Open windows under what was drawn for some environments, shape (n,)."""
+        self._bin[ids] = drawn.bins
+        self._creditable[ids] = drawn.creditable
         self.sums[ids] = 0.0
-        return command.to(torch.float32), (command[:, :3] == 0.0).all(dim=1)
 
     def spoil(self, ids: Tensor | slice) -> None:
         """Deny success to the open windows of some environments, shape (n,): they fell in them, say."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -25,6 +25,21 @@ SPAWN_CLEARANCE = 0.04
 Step = TypeVar("Step", int, Tensor)
 
 
+class Draws(NamedTuple):
+    """What is drawn anew at each reset, a row for each of some environments."""
+
+    friction: Tensor
+    """Shape (n,)."""
+    motor_offset: Tensor
+    """Canonical [rad], shape (n, 32)."""
+    latency: Tensor
+    """Share of the control step, shape (n, 1)."""
+    stiffness_scale: Tensor
+    """Shape (n, 32)."""
+    damping_scale: Tensor
+    """Shape (n, 32)."""
+
+
 class Randomizer:
     """Draws and applies every row of the randomization table; nominal values where a row is off."""
 
@@ -45,16 +60,21 @@ class Randomizer:
         """Offset of the PD targets, canonical [rad], shape (N, 32)."""
         self.latency = mass.new_zeros(num_envs, 1)
         """Age of the proprioception as a share of the control step, shape (N, 1)."""
+        self.reset_keys, self.start_keys = rng.keys("reset"), rng.keys("initial_state")
+        """Of the random streams, shape (N,)."""
         self._stiffness_scale = mass.new_ones(num_envs, NUM_SLOTS)
         self._damping_scale = mass.new_ones(num_envs, NUM_SLOTS)
 
-    def reset(self, ids: Tensor, count: Tensor, step_dt: float) -> None:
-        """Redraw what is redrawn at each reset for some environments, ``count`` being their episode numbers."""
-        if not self.cfg.enabled:
-            return
+    def draw(self, ids: Tensor, count: Tensor, step_dt: float) -> Draws | None:
+        """Draw what is redrawn at each reset for some environments, ``count`` being their episode numbers; (n,) each.
+
+        None where nothing is randomized. Nothing changes before :meth:`put`.
+        """
         cfg = self.cfg
+        if not cfg.enabled:
+            return None
         strength, friction, motor_offset, latency, stiffness, damping = self._draw(
-            "reset",
+            self.reset_keys,
             ids,
             count,
             (cfg.strength_scale, NUM_SLOTS),
@@ -64,12 +84,16 @@ class Randomizer:
             (cfg.stiffness_scale, NUM_SLOTS),
             (cfg.damping_scale, NUM_SLOTS),
         )
-        self.friction[ids] = friction.squeeze(1)
-        self.motor_offset[ids] = motor_offset * self.robots.slot_mask[ids]
-        self.latency[ids] = latency / step_dt
-        self._stiffness_scale[ids] = strength * stiffness
-        self._damping_scale[ids] = strength * damping
-        self._apply(ids)
+        offset = motor_offset * self.robots.slot_mask[ids]
+        return Draws(friction.squeeze(1), offset, latency / step_dt, strength * stiffness, strength * damping)
+
+    def put(self, ids: Tensor, draws: Draws) -> None:
+        """Let what was drawn for some environments, shape (n,), be in force."""
+        self.friction[ids], self.motor_offset[ids] = draws.friction, draws.motor_offset
+        self.latency[ids] = draws.latency
+        self._stiffness_scale[ids], self._damping_scale[ids] = draws.stiffness_scale, draws.damping_scale
+        self._pool.set_friction(ids, draws.friction)
+        self._pool.scale_gains(ids, draws.stiffness_scale, draws.damping_scale)
 
     def initial_state(self, ids: Tensor, count: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Draw initial states: root (n, 13), canonical joint positions [rad] and velocities [rad/s] (n, 32)."""
@@ -80,7 +104,7 @@ class Randomizer:
         if not self.cfg.enabled:
             return root, robots.default_joint_pos, torch.zeros_like(robots.default_joint_pos)
         root[:, 0:2], yaw, root[:, 7:13], scale, joint_vel = self._draw(
-            "initial_state",
+            self.start_keys,
             ids,
             count,
             ((-1.0, 1.0), 2),
@@ -93,7 +117,7 @@ class Randomizer:
         joint_pos = (robots.default_joint_pos * scale).clamp(robots.joint_soft_lower, robots.joint_soft_upper)
         return root, joint_pos, joint_vel * robots.slot_mask
 
-    def _draw(self, stream: str, ids: Tensor, count: Tensor, *rows: tuple[Range, int]) -> list[Tensor]:
+    def _draw(self, stream: Tensor, ids: Tensor, count: Tensor, *rows: tuple[Range, int]) -> list[Tensor]:
         """Draw several quantities from one stream, each from its range and so many wide, shapes (n, width)."""
         widths = [width for _, width in rows]
         numbers = self._rng.uniform(stream, count, sum(widths), ids).to(self.friction.dtype)
@@ -122,9 +146,6 @@ class Randomizer:
         for name, value in state.items():
             getattr(self, name).copy_(value)
         if self.cfg.enabled:
-            self._apply(torch.arange(len(self.friction), device=self.friction.device))
-
-    def _apply(self, ids: Tensor) -> None:
-        """Write friction and gains of some environments into the physics."""
-        self._pool.set_friction(ids, self.friction[ids])
-        self._pool.scale_gains(ids, self._stiffness_scale[ids], self._damping_scale[ids])
+            everyone = torch.arange(len(self.friction), device=self.friction.device)
+            self._pool.set_friction(everyone, self.friction)
+            self._pool.scale_gains(everyone, self._stiffness_scale, self._damping_scale)

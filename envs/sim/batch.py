@@ -67,6 +67,7 @@ class RobotBatch:
             (self.columns["ctrl"], self.ctrl),
             (self.columns["actuator_force"], self.actuator_force),
         )
+        self._own_fields: dict[str, Array] = {}
         self._batch.reset(keyframe=0)
 
     def step(self, targets: Array, aimed: NDArray[np.bool_] | bool = True) -> None:
@@ -89,6 +90,10 @@ class RobotBatch:
         for columns, values in self._written:
             out[ids, columns] = values[ids]
 
+    def readings(self, out: Array) -> list[tuple[Array, Array]]:
+        """Where :meth:`read` would write, and what it would, for who does so again and again."""
+        return [(out[:, columns], values) for columns, values in self._written]
+
     def refresh(self, ids: Ids) -> None:
         """Recompute every derived quantity of some simulations from their state, after it was written."""
         self._batch.forward(ids, stage=_ACC)
@@ -104,13 +109,19 @@ class RobotBatch:
         self._batch.warning[ids] = 0
         self.refresh(ids)
 
+    def _own(self, name: str) -> Array:
+        """A field of the model of which every simulation has its own, shape (n, ...)."""
+        if name not in self._own_fields:
+            self._own_fields[name] = self._batch.expand(name)
+        return self._own_fields[name]
+
     def apply_base_wrench(self, wrench: Array) -> None:
         """Hold a world-frame force [N] and torque [N m] on every base until the next call, shape (n, 6)."""
         self._xfrc[:, self._base] = wrench
 
     def set_base_damping(self, damping: Array) -> None:
         """Set the damping of every base's rotation [N m s/rad], shape (n,)."""
-        self._batch.expand("dof_damping")[:, 3:6] = damping[:, None]
+        self._own("dof_damping")[:, 3:6] = damping[:, None]
 
     def push(self, ids: Ids, lin_vel_w: Array, ang_vel_b: Array) -> None:
         """Add velocity to some bases [m/s, rad/s], shape (m, 3) each."""
@@ -123,13 +134,13 @@ class RobotBatch:
         The ground has priority over the robot's geoms, so this alone is the effective coefficient.
         """
         floor = self.model.geom("floor").id
-        self._batch.expand("geom_friction")[ids, floor, 0] = friction
+        self._own("geom_friction")[ids, floor, 0] = friction
 
     def set_gains(self, ids: Ids, stiffness: Array, damping: Array) -> None:
         """Set kp [N m/rad] and kd [N m s/rad] of some simulations, shape (m, joints)."""
-        self._batch.expand("actuator_gainprm")[ids, :, 0] = stiffness
-        self._batch.expand("actuator_biasprm")[ids, :, 1] = -stiffness
-        self._batch.expand("dof_damping")[ids, 6:] = damping
+        self._own("actuator_gainprm")[ids, :, 0] = stiffness
+        self._own("actuator_biasprm")[ids, :, 1] = -stiffness
+        self._own("dof_damping")[ids, 6:] = damping
 
     def change_bodies(self, length_scale: Array, mass_scale: Array, added_mass: Array, com_offset: Array) -> None:
         """Change every simulation's bodies once, then recompute the constants MuJoCo derives from them.
@@ -141,9 +152,9 @@ class RobotBatch:
             com_offset: shift of the centre of mass in the body frame [m], shape (n, nbody, 3).
         """
         length = length_scale[:, None, None]
-        self._batch.expand("body_mass")[:] = self.model.body_mass * mass_scale + added_mass
-        self._batch.expand("body_inertia")[:] = self.model.body_inertia * mass_scale[..., None] * length**2
-        self._batch.expand("body_ipos")[:] = self.model.body_ipos * length + com_offset
+        self._own("body_mass")[:] = self.model.body_mass * mass_scale + added_mass
+        self._own("body_inertia")[:] = self.model.body_inertia * mass_scale[..., None] * length**2
+        self._own("body_ipos")[:] = self.model.body_ipos * length + com_offset
         if (length_scale != 1.0).any():
             self._scale_geometry(length_scale)
         self._batch.set_const()
@@ -155,7 +166,7 @@ class RobotBatch:
         owners |= dict.fromkeys(("geom_pos", "geom_size", "geom_rbound"), model.geom_bodyid)
         for name, bodies in owners.items():
             nominal = getattr(model, name)[bodies > 0]
-            self._batch.expand(name)[:, bodies > 0] = np.multiply.outer(scale, nominal)
+            self._own(name)[:, bodies > 0] = np.multiply.outer(scale, nominal)
 
     def fault(self, env: int, cause: str, rows: Array) -> Fault:
         """What a simulation did before it fell ill, from rows of its last steps, see ``columns``, shape (k, width)."""

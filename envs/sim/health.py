@@ -108,11 +108,16 @@ class FlightRecorder:
         """The same rows, in the same memory."""
         return self._tensors[self._latest]
 
-    def next(self) -> Array:
-        """Rows to be written in a new step: the oldest, which they replace, shape (num_envs, width)."""
+    @property
+    def all(self) -> Array:
+        """Rows of every step that is kept, shape (``LENGTH``, num_envs, width)."""
+        return self._rows
+
+    def next(self) -> int:
+        """Which of ``all`` is to be written in a new step: the oldest."""
         self._latest = (self._latest + 1) % self.LENGTH
         self._age += 1
-        return self.latest
+        return self._latest
 
     def forget(self, envs: NDArray[np.int64] | slice) -> None:
         """Drop what was kept of some environments, which begin anew."""

@@ -76,6 +76,11 @@ class PhysicsPool:
         self.conventions = self._layout.conventions(self._of_robots, device)
         self.columns = self._layout.columns
         self._recorder = FlightRecorder(self.num_envs, self._layout.width, pin_memory=device.type == "cuda")
+        self._readings = [
+            [batch.readings(kept[rows]) for batch, rows in zip(self.batches, self.rows, strict=True)]
+            for kept in self._recorder.all
+        ]
+        self._split: tuple[Tensor | None, list[tuple[int, Ids, Ids]]] = None, []
         self._read()
         self.native = self._recorder.tensor.to(device)
         """What MuJoCo wrote in the last step, robot by robot, shape (N, columns of the widest)."""
@@ -117,14 +122,15 @@ class PhysicsPool:
         native = targets.cpu().numpy()
         forces = None if wrench is None else wrench.to("cpu", torch.float64).numpy()
         aimed = ~self.wild.cpu().numpy()[:, None] if self.wild.any() else None
-        after = self._recorder.next()
+        after = self._readings[self._recorder.next()]
 
         def advance(part: int) -> None:
             batch, rows = self.batches[part], self.rows[part]
             if forces is not None:
                 batch.apply_base_wrench(forces[rows])
             batch.step(native[rows, : batch.spec.num_joints], True if aimed is None else aimed[rows])
-            batch.read(after[rows])
+            for written, values in after[part]:
+                written[:] = values
 
         self.threads.share_out(advance, range(len(self.batches)))
         self.native = self._recorder.tensor.to(self.device, non_blocking=True)
@@ -138,13 +144,16 @@ class PhysicsPool:
 
     def split(self, ids: Tensor) -> list[tuple[int, Ids, Ids]]:
         """Split sorted pool rows by batch: (batch's index, rows local to it, positions in ``ids``)."""
-        rows = ids.cpu().numpy()
-        cuts = np.searchsorted(rows, self._edges)
-        return [
-            (part, rows[start:stop] - self._edges[part], np.arange(start, stop))
-            for part, (start, stop) in enumerate(pairwise(cuts))
-            if stop > start
-        ]
+        if ids is not self._split[0]:  # a reset asks several times
+            rows = ids.cpu().numpy()
+            cuts = np.searchsorted(rows, self._edges)
+            parts = [
+                (part, rows[start:stop] - self._edges[part], np.arange(start, stop))
+                for part, (start, stop) in enumerate(pairwise(cuts.tolist()))
+                if stop > start
+            ]
+            self._split = ids, parts
+        return self._split[1]
 
     def reset(self, ids: Tensor, root: Tensor, joint_pos: Tensor, joint_vel: Tensor) -> Tensor:
         """Write states and return the new staging rows.

@@ -19,7 +19,7 @@ from tests.envs.worlds import actions, assert_same, make_env
 
 N = 13
 """Environments: no other width of the pool's tensors, so that a constant of this size is one of an environment."""
-PARTS = ("_aim", "_judge", "_derive_groups", "_sense")
+PARTS = ("_aim", "_judge", "_derive_groups", "_look", "_begin")
 
 
 @dataclass(kw_only=True)
