@@ -298,7 +298,7 @@ class HumanoidEnv(ControlStep, VecEnv):
         self.aids.update(episode_ratio(falls, self.max_episode_length), match_per_robot)
         self._apply_aids()
         self.commands.sampler.weights = self.over_processes(self.commands.sampler.weights, "max")
-        entry["Curriculum/penalty_scale"] = torch.tensor(self.penalty_scale)
+        entry["Curriculum/penalty_scale"] = self.penalty_scale
         names = self.robot_names
         return entry | self.commands.log() | self.aids.log(names) | self.ground.log(names)
 

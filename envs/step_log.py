@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -82,7 +83,7 @@ class StepLog:
         self._sums = self._sums.index_add(0, self._robot_id, rows)
         self._steps += 1
 
-    def flush(self) -> tuple[dict[str, Tensor], Tensor, Tensor]:
+    def flush(self) -> tuple[dict[str, float], Tensor, Tensor]:
         """Return the interval's tags, each robot's falls per step (R,) and contact match (R,), and start anew.
 
         Rewards are per second, terminations are shares of the episodes that ended, errors are means over steps, causes
@@ -108,10 +109,8 @@ class StepLog:
             ),
             dim=1,
         )
-        columns = (*self._columns[:-4], "Health/sick_share", "Metrics/contact_match", "Metrics/falls_per_1000_steps")
-        tags = [f"{column}/{name}" for name in self._names for column in columns]
         self._sums, self._steps = torch.zeros_like(sums), 0
-        entry = dict(zip(tags, table.float().flatten().unbind(), strict=True))
+        entry = dict(zip(_tags(tuple(self._columns), tuple(self._names)), table.flatten().tolist(), strict=True))
         return entry, falls_per_step.squeeze(1), match.squeeze(1)
 
     def state_dict(self) -> dict[str, Any]:
@@ -127,3 +126,10 @@ class StepLog:
         sums: Tensor | None = state["sums"]
         self._sums = None if sums is None else sums.to(self._robot_id.device)
         self._steps, self._columns = state["steps"], list(state["columns"])
+
+
+@lru_cache(maxsize=8)
+def _tags(columns: tuple[str, ...], names: tuple[str, ...]) -> list[str]:
+    """Tags of a flush: what :meth:`StepLog.rows` calls its columns, the last four worked up, for each robot."""
+    told = (*columns[:-4], "Health/sick_share", "Metrics/contact_match", "Metrics/falls_per_1000_steps")
+    return [f"{column}/{name}" for name in names for column in told]
