@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import reduce
 
 import torch
 from rsl_rl.models import MLPModel
@@ -21,13 +20,16 @@ KL = "Loss/kl"
 class Gradient:
     """Puts the gradient of the sum of all terms into the parameters of actor and critic.
 
-    It is one vector, of which each parameter's is a view: to add up and to measure dozens of tensors takes longer.
+    It is one vector, of which each parameter's is a view, from one minibatch to the next: to add up, to measure and to
+    hand over dozens of tensors takes longer.
     """
 
     def __init__(self, actor: EagleActor, critic: MLPModel, mixed_precision: bool) -> None:
         """Start without terms; with ``mixed_precision`` hidden layers multiply in bfloat16."""
         self._loss = _Loss(actor, critic, mixed_precision)
         self._shared = Shared(self._loss)
+        self._vector = torch.empty(0)
+        self._views: list[tuple[Tensor, Tensor]] = []
         self._parts: Sequence[Tensor] = ()
         self.terms: list[Term] = self._loss.terms
         """What is summed; complete before the first minibatch."""
@@ -40,14 +42,28 @@ class Gradient:
         Returns:
             Unweighted losses by tag: sum and weight, shape (2,).
         """
-        vector, sums = (reduce(torch.add, same) for same in zip(*self._shared(shares), strict=True))
+        vectors, sums = zip(*self._shared(shares), strict=True)
+        first, *others = vectors
+        if len(self._vector) != len(first) or any(parameter.grad is not view for parameter, view in self._views):
+            self._lay_out(first)
+        if others:
+            torch.add(first, others[0], out=self._vector)
+        else:
+            self._vector.copy_(first)
+        for vector in others[1:]:
+            self._vector += vector
+        return dict(zip(self._loss.tags, torch.stack(sums).sum(dim=0), strict=True))
+
+    def _lay_out(self, vector: Tensor) -> None:
+        """Give every parameter on which the loss depends its part of such a vector for a gradient."""
         learned = self._loss.learned
-        sizes = [parameter.numel() for parameter in learned]
-        for parameter, part in zip(learned, vector.split(sizes), strict=True):
-            parameter.grad = part.view_as(parameter)
-        actors = sum(p.numel() for p in self._loss.actor.parameters() if p.grad is not None)
-        self._parts = vector.tensor_split([actors])
-        return dict(zip(self._loss.tags, sums, strict=True))
+        self._vector = torch.empty_like(vector)
+        parts = self._vector.split([parameter.numel() for parameter in learned])
+        self._views = [(p, part.view_as(p)) for p, part in zip(learned, parts, strict=True)]
+        for parameter, view in self._views:
+            parameter.grad = view
+        actors = {id(parameter) for parameter in self._loss.actor.parameters()}
+        self._parts = self._vector.tensor_split([sum(p.numel() for p in learned if id(p) in actors)])
 
     def clip(self, max_norm: float) -> Tensor:
         """Shorten the actor's and the critic's gradient to this length; return the lengths they had, shape (2,)."""
