@@ -298,7 +298,7 @@ _PARTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ),
     ),
     "_derive_groups": ((*_STATE, "_last_frame", "embodiment"), ()),
-    "_look": ((*_STATE, "_last_frame", "embodiment"), ("_last_frame",)),
+    "_look": ((*_STATE, "embodiment"), ("_last_frame",)),
     "_begin": (
         (
             *("randomizer.robots", "episode_count", "randomizer.reset_keys", "randomizer.start_keys"),

@@ -28,6 +28,8 @@ SLOTS = "envs/robots/slots.py"
 EMBODIMENT = "envs/robots/embodiment.py"
 POOLING = "envs/pooling.py"
 STAGING = "envs/sim/staging.py"
+HEALTH = "envs/sim/health.py"
+PHYSICS_POOL = "envs/sim/pool.py"
 AIDS = "envs/mdp/aids.py"
 POSTURE = "envs/robots/posture.py"
 RESTING = "envs/mdp/posture.py"
@@ -51,6 +53,8 @@ ACTOR = "eagle_rl/models/actor.py"
 SHARING = "eagle_rl/algorithms/sharing.py"
 GRADIENT = "eagle_rl/algorithms/gradient.py"
 THREADS = "eagle_rl/threads.py"
+KERNELS = "eagle_rl/kernels.py"
+PRECISION = "eagle_rl/models/precision.py"
 
 REWARD_TESTS = "mdp/test_rewards.py"
 LEARNER_TESTS = "learner/test_eagle_ppo.py"
@@ -122,6 +126,16 @@ MUTANTS: tuple[Mutant, ...] = (
     Mutant(STAGING, "position - conv", "position + conv", "envs/test_physics.py"),
     Mutant(STAGING, "force - damping", "force + damping", "envs/test_physics.py"),
     Mutant(STAGING, "* chosen + conv", "* chosen - conv", "envs/test_physics.py"),
+    Mutant(HEALTH, "size <= largest", "size < largest", "envs/test_health.py"),
+    Mutant(HEALTH, 'MAX_SPEED, "velocity"', 'MAX_SPEED, "distance"', "envs/test_health.py"),
+    Mutant(HEALTH, "code.clamp(max=", "code.clamp(min=", "envs/test_health.py"),
+    Mutant(PHYSICS_POOL, "self.causes.unsqueeze(1) > 0", "self.causes.unsqueeze(1) < 0", "envs/test_health.py"),
+    Mutant(CONTROL_STEP, "in (dones, cut, due, sick)", "in (cut, dones, due, sick)", "envs/test_humanoid_env.py"),
+    Mutant(RECORDING, "else x[:count]", "else x[-count:]", "envs/test_recording.py"),
+    Mutant(KERNELS, "(*node.args[:4], True,", "(*node.args[:4], False,", "test_kernels.py"),
+    Mutant(KERNELS, "(product, negative)", "(negative, product)", "test_kernels.py"),
+    Mutant(PRECISION, "and not _is_intels", "and _is_intels", "learner/test_precision.py"),
+    Mutant(GRADIENT, "if id(p) in actors", "if id(p) not in actors", LEARNER_TESTS),
     Mutant("envs/sim/batch.py", "env=self.first_env + env", "env=env", "envs/test_threads.py"),
     # observations
     Mutant(
