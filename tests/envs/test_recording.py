@@ -14,7 +14,7 @@ from eagle_rl import kernels
 from eagle_rl.config.schema import AidsCfg, CommandsCfg, ControlCfg, ObservationsCfg, TaskCfg, TerrainCfg
 from eagle_rl.errors import CompileError, EagleWarning
 from envs.humanoid_env import HumanoidEnv
-from envs.recording import Recording
+from envs.recording import InBlocks, Recording
 from tests.envs.worlds import actions, assert_same, make_env
 
 N = 13
@@ -102,6 +102,31 @@ def test_recording_leaves_the_owner_as_it_was_and_results_share_no_memory() -> N
     tally.pair.right.zero_()
     assert tally.pair.left.any(), "a view was handed out"
     assert before.left.tolist() == torch.arange(6.0).view(2, 3).tolist()
+
+
+class Lottery:
+    """A method of any number of rows, one of whose results is left out."""
+
+    def __init__(self) -> None:
+        self.prizes = torch.arange(10.0)
+        self.calls = 0
+
+    def draw(self, ids: Tensor) -> Sums:
+        self.calls += 1
+        return Sums(self.prizes[ids] * 2.0, None)
+
+
+@pytest.mark.usefixtures("uncompiled")
+@pytest.mark.parametrize("count", [1, 2, 3, 4])
+def test_a_recording_in_blocks_returns_as_many_rows_as_are_asked_for(count: int) -> None:
+    lottery, ids = Lottery(), torch.tensor([7, 2, 5, 9])[:count]
+    recording = Recording(lottery, lottery.draw, ("prizes",))
+    recording.make(torch.zeros(3, dtype=torch.long))
+    draw, recorded = InBlocks(recording, lottery.draw, 3), lottery.calls
+    drawn = draw(ids)
+    assert drawn.total.tolist() == [2.0 * i for i in ids.tolist()]
+    assert drawn.scaled is None
+    assert lottery.calls - recorded == (count > 3), "more rows than a block are left to the method, fewer are not"
 
 
 @pytest.mark.usefixtures("uncompiled")
