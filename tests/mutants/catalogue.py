@@ -292,7 +292,7 @@ MUTANTS: tuple[Mutant, ...] = (
     Mutant(TRIALS, "t >= self._cfg.settling_steps", "t > self._cfg.settling_steps", "evaluation/test_trials.py"),
     Mutant(PPO, "(last / first) ** min", "(first / last) ** min", LEARNER_TESTS),
     Mutant(LOSSES, "return -torch.min(ratio", "return -torch.max(ratio", "learner/test_losses.py"),
-    Mutant(GRADIENT, "(reduce(torch.add, same) for", "(same[0] for", "learner/test_sharing.py"),
+    Mutant(GRADIENT, "torch.add(first, others[0],", "torch.add(first, first,", "learner/test_sharing.py"),
     Mutant(GRADIENT, "(max_norm / (norms + 1e-6))", "(max_norm / (norms.sum() + 1e-6))", LEARNER_TESTS),
     Mutant(TERMS, "self.coef * rows.sum() / everyone", "self.coef * rows.sum() / own", "learner/test_sharing.py"),
     Mutant(SHARING, "range(self.index, rows, self.count)", "range(0, rows, self.count)", "learner/test_rollout.py"),
