@@ -29,9 +29,9 @@ class StepLog:
     def __init__(self, robot_names: list[str], robot_id: Tensor) -> None:
         """Start empty for robots of these names; ``robot_id`` is each environment's, shape (N,)."""
         self._names = robot_names
+        self._robot_id = robot_id
         counts = torch.bincount(robot_id, minlength=len(robot_names)).to(torch.float64)
         self._num_envs = counts.unsqueeze(1)
-        self._robot_id = robot_id
         self._cause_codes = torch.arange(1, len(CAUSES) + 1, device=robot_id.device)
         self._sums: Tensor | None = None
         self._columns: list[str] = []

@@ -52,3 +52,14 @@ def test_the_derivative_from_the_result_is_right_for_every_slope(alpha):
     (found,) = kernels.record(slope, [x])(x)
     expected = torch.where(x > 0, torch.ones(4), alpha * torch.exp(x))
     torch.testing.assert_close(found, expected)
+
+
+def test_kernels_are_called_without_python(monkeypatch):
+    """Threads compute side by side only if a call leaves the interpreter's lock alone, which C++ wrappers do."""
+    import torch._inductor as inductor
+
+    asked = {}
+    monkeypatch.setattr(inductor, "compile", lambda graph, fakes, options: asked.update(options) or graph)
+    inputs = [torch.ones(3)]
+    kernels.compile_graph(kernels.record(lambda x: [x + 1], inputs), inputs)
+    assert asked["cpp_wrapper"] is True, "a kernel that keeps Python to itself makes the others wait"

@@ -111,21 +111,6 @@ class CommandSampler:
         """Add one step's success quantities, each 1 at best, shape (N, 4) (see ``rewards.success_scores``)."""
         self.sums = self.sums + scores
 
-    def sample(self, ids: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
-        """Close the windows of some environments and draw their next commands.
-
-        Args:
-            ids: environments, shape (n,).
-            count: how often each has drawn before, int64, shape (n,).
-
-        Returns:
-            Commands (v_x, v_y, omega, h, p), float32, shape (n, 5), and whether all velocities are zero, bool, (n,).
-        """
-        self.close(ids)
-        drawn = self.draw(ids, count)
-        self.open(ids, drawn)
-        return drawn.command, (drawn.command[:, :3] == 0.0).all(dim=1)
-
     def draw(self, ids: Tensor, count: Tensor) -> DrawnCommands:
         """Draw commands for some environments, shape (n,), that have drawn so often before, (n,); nothing changes."""
         draws = self._rng.uniform(self.keys, count, 8, ids).to(torch.float64)

@@ -93,7 +93,7 @@ class PhysicsPool:
         damping = [np.tile(batch.spec.to_slots(batch.spec.damping), (batch.num_envs, 1)) for batch in self.batches]
         self.damping = torch.from_numpy(np.concatenate(damping)).to(device)
         """kd in force, in slots [N m s/rad], shape (N, 32)."""
-        self.staged = self._rows(slice(None))
+        self.staged = self._rows(self.native)
         """Staging rows, see :func:`staging_columns`, shape (N, columns); a new tensor at each step. Rows of sick
         environments stay as they were in the step before, so that nothing that is not finite gets out."""
 
@@ -140,7 +140,7 @@ class PhysicsPool:
         time, robot, of = self.native[:, self._layout.time], self.conventions.robot, self.conventions
         self.causes = diagnose(self.native, of.largest[robot], of.beyond[robot], time > self.clock, self.wild)
         self.clock = time.clone()
-        self.staged = torch.where(self.causes.unsqueeze(1) > 0, self.staged, self._rows(slice(None)))
+        self.staged = torch.where(self.causes.unsqueeze(1) > 0, self.staged, self._rows(self.native))
 
     def split(self, ids: Tensor) -> list[tuple[int, Ids, Ids]]:
         """Split sorted pool rows by batch: (batch's index, rows local to it, positions in ``ids``)."""
@@ -173,8 +173,7 @@ class PhysicsPool:
             batch.reset(local, qpos, qvel)
             batch.read(self._recorder.latest[self.rows[part]], local)
         self._recorder.forget(ids.cpu().numpy())
-        self.native = self._recorder.tensor.to(self.device)
-        rows = self._rows(ids)
+        rows = self._rows(self._recorder.tensor[ids.cpu()].to(self.device), ids)
         self.staged = self.staged.index_copy(0, ids, rows)
         self.clock = self.clock.index_fill(0, ids, 0.0)
         return rows
@@ -237,9 +236,9 @@ class PhysicsPool:
                 cause = CAUSES[causes[row] - 1]
                 self.batches[part].fault(env, cause, self._recorder.last(row)).save(self.fault_folder)
 
-    def _rows(self, ids: Tensor | slice) -> Tensor:
-        """Staging rows of some environments as they are now."""
-        return self._layout.rows(self.native[ids], self.damping[ids], self.conventions.robot[ids], self.conventions)
+    def _rows(self, native: Tensor, ids: Tensor | slice = slice(None)) -> Tensor:
+        """Staging rows of some environments, from what MuJoCo wrote of them."""
+        return self._layout.rows(native, self.damping[ids], self.conventions.robot[ids], self.conventions)
 
     def _read(self) -> None:
         """Take what MuJoCo wrote last for the latest."""

@@ -46,7 +46,7 @@ class Conventions:
 
 
 class Staging:
-    """Turns native rows, see ``RobotBatch.columns``, into staging rows, and canonical targets into native ones."""
+    """Turns native rows, see ``RobotBatch.columns``, into staging rows."""
 
     def __init__(self, batches: Sequence[RobotBatch], dtype: torch.dtype) -> None:
         """Take the columns of ``batches``; staging rows are of type ``dtype``."""

@@ -246,6 +246,18 @@ def test_pinned_commands_stay_in_force_until_released() -> None:
     assert len(env.command.unique(dim=0)) == 4
 
 
+@pytest.mark.parametrize("pinned", [True, False])
+def test_a_window_in_which_commands_were_pinned_opens_nothing(pinned: bool) -> None:
+    env = make_env()
+    sampler, before = env.commands.sampler, env.commands.sampler.weights.clone()
+    sampler.sums, sampler._creditable[:] = torch.full_like(sampler.sums, 1e9), True
+    if pinned:
+        env.pin_commands(torch.zeros(4, 5))
+        env.pin_commands(None)
+    env.commands.draw(torch.arange(4))
+    assert torch.equal(sampler.weights, before) is pinned, "what was pinned is no success of what was sampled"
+
+
 def test_commands_are_redrawn_at_the_interval() -> None:
     env = make_env(task=replace(TaskCfg(), commands=CommandsCfg(resampling_time_s=0.1)))
     commands = [env.command, *(env.command for _ in rollout(env, 12, scale=0.0))]

@@ -24,9 +24,17 @@ def sampler(cfg: CommandsCfg = CFG, seed: int = 0, num_envs: int = 200, num_robo
     return CommandSampler(cfg, robots, num_robots, CounterRng(seed, names, torch.arange(num_envs)))
 
 
+def sample(s: CommandSampler, ids: torch.Tensor, count: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Close some environments' windows and open the next; their commands, and whether all velocities are zero."""
+    s.close(ids)
+    drawn = s.draw(ids, count)
+    s.open(ids, drawn)
+    return drawn.command, (drawn.command[:, :3] == 0.0).all(dim=1)
+
+
 def draw(s: CommandSampler, count: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
     ids = torch.arange(len(s.robot_id))
-    return s.sample(ids, torch.full_like(ids, count))
+    return sample(s, ids, torch.full_like(ids, count))
 
 
 def track(s: CommandSampler, steps: int = WINDOW, **scores: float) -> None:
@@ -103,7 +111,7 @@ def test_success_raises_the_bin_and_its_neighbours_of_that_robot_alone() -> None
     env = int((state["creditable"] & (state["bin"] == 7 * 8 + 5)).nonzero()[0, 0])  # the upper corner of the box
     track(s)
     before = s.weights.clone()
-    s.sample(torch.tensor([env]), torch.tensor([1]))
+    sample(s, torch.tensor([env]), torch.tensor([1]))
     gain = (s.weights - before).view(NUM_ROBOTS, 12, 8)
     robot = int(s.robot_id[env])
     expected = torch.zeros(12, 8, dtype=torch.float64)
@@ -148,7 +156,7 @@ def test_windows_with_a_zeroed_velocity_do_not_count() -> None:
     env = winner(s, creditable=False)
     before = s.weights.clone()
     track(s)
-    s.sample(torch.tensor([env]), torch.tensor([1]))
+    sample(s, torch.tensor([env]), torch.tensor([1]))
     assert torch.equal(s.weights, before)
 
 
@@ -180,8 +188,8 @@ def test_state_survives_saving() -> None:
 
 def test_draws_depend_on_the_environment_not_on_who_else_draws() -> None:
     ids, counts = torch.arange(200), torch.zeros(200, dtype=torch.int64)
-    together = sampler().sample(ids, counts)[0]
-    alone = sampler().sample(ids[7:9], counts[7:9])[0]
+    together = sample(sampler(), ids, counts)[0]
+    alone = sample(sampler(), ids[7:9], counts[7:9])[0]
     assert torch.equal(together[7:9], alone)
 
 
