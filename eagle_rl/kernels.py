@@ -47,6 +47,17 @@ def record(function: Callable[..., list[Tensor]], inputs: Sequence[Tensor]) -> f
     return graph
 
 
+def drop_unused(graph: fx.GraphModule) -> list[int]:
+    """Take from a graph the inputs that it does not use; which those are that are left."""
+    places = [node for node in graph.graph.nodes if node.op == "placeholder"]
+    used = [i for i, place in enumerate(places) if place.users]
+    for place in places:
+        if not place.users:
+            graph.graph.erase_node(place)
+    graph.recompile()
+    return used
+
+
 def _lighten(graph: fx.GraphModule) -> None:
     """Do the same with less, as far as it is in float32; bfloat16 would round differently.
 

@@ -29,7 +29,7 @@ from .mdp.observations import (
 from .mdp.posture import RestingPose
 from .mdp.randomization import Draws, Randomizer
 from .mdp.rewards import RewardContext, compute_rewards, success_scores
-from .mdp.terminations import terminations
+from .mdp.terminations import REASONS, terminations
 from .measure import measured
 from .recording import InBlocks, Recording
 from .rng import CounterRng
@@ -58,8 +58,6 @@ class Judgement(NamedTuple):
     which are noise to who learns (docs/experiments.md, 14); bool, shape (N,)."""
     flags: Tensor
     """Whether any of ``dones``, of ``cut``, of the commands whose time is up, of the sick, bool, shape (4,)."""
-    log_rows: Tensor
-    """See ``StepLog.rows``."""
     command: Tensor
     clock: Tensor
     critic: Tensor
@@ -176,7 +174,8 @@ class ControlStep:
         """Native PD targets, (N, most joints), and the harness' wrench on the bases, (N, 6), or None without one."""
         self._last_joint_vel, self._last_contact = self.state.joint_vel, self.state.foot_contact
         targets = self.pool.aim(self._act(actions))
-        return targets, None if self._harness is None else harness_wrench(self.state, self.robots, self._harness)
+        harness = self._harness
+        return targets, None if harness is None else harness_wrench(self.state, self.robots, harness).double()
 
     def _act(self, actions: Tensor) -> Tensor:
         """Remember the actions and turn them into canonical PD targets [rad], (N, 32); NaN where one is absurd."""
@@ -185,7 +184,7 @@ class ControlStep:
         self._last_last_actions, self._last_actions = self._last_actions, self._actions
         self._actions = torch.where(live & sound, actions.to(self._actions.dtype).clamp(-clip, clip), 0.0)
         targets = self.posture.advance(self.command) + self.robots.action_scale * self._actions
-        absurd = (live & ~sound).any(dim=1, keepdim=True)
+        absurd = ~(torch.where(live, actions, 0.0).abs().amax(dim=1, keepdim=True) <= MAX_ACTION)
         return (targets + self.randomizer.motor_offset).masked_fill(absurd, torch.nan)
 
     def _judge(self) -> Judgement:
@@ -205,7 +204,8 @@ class ControlStep:
         scores = torch.stack(success_scores(state, robots, context), dim=1)
         self.ground.judge(scores[:, 0], state)
         errors, match = self.tracking_errors(), contact_match(state, task.gait)
-        log_rows = self.step_log.rows(terms, reasons, causes, errors, match, dones & ~time_outs, dones, state.standing)
+        falls, why = dones & ~time_outs, [reasons[name] for name in REASONS]
+        self.step_log.add([*terms.values()], why, causes, errors, match, falls, dones, state.standing)
         self.commands.judge(scores)
         due = self.commands.due()
         surprised = due | self.randomizer.pushes_at(self._step_count, self.step_dt)
@@ -213,7 +213,7 @@ class ControlStep:
         flags = torch.stack([where.any() for where in (dones, cut, due, sick)])
         self._observe()
         rewards = rewards.masked_fill(sick, 0.0).float()
-        return Judgement(rewards, dones, time_outs, fallen, cut, flags, log_rows, *self._derive_groups())
+        return Judgement(rewards, dones, time_outs, fallen, cut, flags, *self._derive_groups())
 
     def _derive_groups(self) -> DerivedGroups:
         """The observation groups that are worked out from the present state."""
@@ -247,9 +247,9 @@ class ControlStep:
         sensed = delay(frame, self._last_frame, self.randomizer.latency)
         if self.task.observations.enable_corruption:
             u = self.rng.uniform_in(-1.0, 1.0, self._noise_keys, self._step_count, SENSED_SIZE)
-            sensed[:, :SENSED_SIZE].addcmul_(u.to(frame.dtype), self._noise[:, :SENSED_SIZE])
+            sensed = sensed.addcmul(u.to(frame.dtype), self._noise[:, :SENSED_SIZE])
         self._last_frame = frame
-        self.history.push(sensed)
+        self.history.push(sensed, frame[:, SENSED_SIZE:])
 
     def _derive(self) -> PooledState:
         """Turn the staging rows into the pooled state, with the command, phase and actions now in force."""
@@ -279,11 +279,11 @@ _STATE = (
 )
 """What ``HumanoidEnv.state`` is made of."""
 _ACTIONS = ("_actions", "_last_actions", "_last_last_actions")
-_FOLLOWED = ("commands.age", "commands.sampler.sums")
+_FOLLOWED = ("commands.age", "commands.sampler.sums", "step_log.sums")
 _PARTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "_aim": (
         (*_STATE, "randomizer.motor_offset", "_live", "_harness", "pool.conventions"),
-        (*_ACTIONS, "_last_joint_vel", "_last_contact", "pool.wild"),
+        (*_ACTIONS, "_last_joint_vel", "_last_contact", "pool.wild", "pool.any_wild"),
     ),
     "_judge": (
         (

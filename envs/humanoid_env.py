@@ -31,7 +31,8 @@ from .mdp.observations import (
 )
 from .mdp.posture import make_posture
 from .mdp.randomization import Randomizer
-from .mdp.rewards import reward_factors
+from .mdp.rewards import reward_factors, terms_in_use
+from .mdp.terminations import REASONS
 from .pooling import pool_robots, share
 from .rng import CounterRng
 from .robots.embodiment import pooled_embodiment
@@ -116,7 +117,7 @@ class HumanoidEnv(ControlStep, VecEnv):
         self.posture = make_posture(task.control, robots, self.robots, dt)
         points = scan_points(observations).to(self.device, dtype)
         self.ground = make_ground(terrain, points, self.robots.robot_id, self.rng, dt, self.max_episode_length)
-        self.step_log = StepLog(self.robot_names, self.robots.robot_id)
+        self.step_log = StepLog(self.robot_names, self.robots.robot_id, terms_in_use(task.rewards.weights), REASONS)
         self.embodiment = (
             pooled_embodiment(robots, self.robots.robot_id, self.randomizer.bodies, observations.descriptor)
             if observations.embodiment_observation
@@ -177,7 +178,7 @@ class HumanoidEnv(ControlStep, VecEnv):
             self.pool.keep_faults()
         extras: dict[str, Any] = {"time_outs": time_outs, "physics_time": self._physics_time}
         extras |= self._final(dones, any_done) if self.final_of_episodes else self._final(judged.cut, any_cut)
-        extras["log"] = self._account(judged.log_rows)
+        extras["log"] = self._account()
         if any_done:
             reset_ids = dones.nonzero().squeeze(1)
             self._reset(reset_ids, judged.fallen[reset_ids])
@@ -288,12 +289,11 @@ class HumanoidEnv(ControlStep, VecEnv):
             self.commands.draw(ids)
             self._forget()
 
-    def _account(self, log_rows: Tensor) -> dict[str, Tensor | float]:
-        """Add the step to the log and the aids; returns tags and values now and then."""
-        self.step_log.add(log_rows)
+    def _account(self) -> dict[str, Tensor | float]:
+        """Now and then, let the aids see how it went; returns tags and values then."""
         if self.common_step_counter % self.task.aids.interval_steps:
             return {}
-        entry, falls_per_step, match_per_robot = self.step_log.flush()
+        entry, falls_per_step, match_per_robot = self.step_log.flush(self.task.aids.interval_steps)
         falls, match_per_robot = self.over_processes(torch.stack((falls_per_step, match_per_robot)), "mean")
         self.aids.update(episode_ratio(falls, self.max_episode_length), match_per_robot)
         self._apply_aids()

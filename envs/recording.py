@@ -52,8 +52,8 @@ class Recording:
     """Stands in for a method of an object, see the module.
 
     Inputs are the method's arguments and the attributes it reads; results are what it returns, a tuple, and the
-    attributes it writes. Every result is a tensor of its own. Attributes that are None are left out, and there is one
-    kernel for each set of those that are not.
+    attributes it writes. A result is an input as it came, or a tensor of its own. Attributes that are None are left
+    out, and there is one kernel for each set of those that are not.
     """
 
     def __init__(
@@ -151,22 +151,31 @@ class _Replay:
         self._owner, self._scratch = owner, [Attribute(path, None) for path in scratch]
         self._reads = [Attribute.of(owner, path) for path in reads]
         self._writes = [Attribute.of(owner, path) for path in writes]
-        self._collect = _getter([path for attribute in self._reads for path in attribute.paths()])
         self._returned: tuple[type, tuple[bool, ...]] = (tuple, ())
-        inputs = [x.detach().clone(memory_format=torch.contiguous_format) for x in (*args, *self._collect(owner))]
-        self._kinds = [(x.dtype, x.stride()) for x in inputs]
+        paths = [path for attribute in self._reads for path in attribute.paths()]
+        given = (*args, *_getter(paths)(owner))
+        inputs = [x.detach().clone(memory_format=torch.contiguous_format) for x in given]
         with torch.inference_mode(False), torch.no_grad():
-            self._run(method, len(args), [x.clone() for x in inputs])  # makes the constants the method keeps
-            self.graph = kernels.record(lambda *tensors: self._run(method, len(args), tensors), inputs)
-        self._kernel = kernels.compile_graph(self.graph, inputs)
+            tried = [x.clone() for x in inputs]
+            results = self._run(method, len(args), tried)  # makes the constants the method keeps
+            passed = [next((i for i, x in enumerate(tried) if x is result), None) for result in results]
+
+            def make(*tensors: Tensor) -> list[Tensor]:
+                made = zip(self._run(method, len(args), tensors), passed, strict=True)
+                return [x.clone(memory_format=torch.contiguous_format) for x, source in made if source is None]
+
+            self.graph = kernels.record(make, inputs)
+        used = kernels.drop_unused(self.graph)
+        self._kernel = kernels.compile_graph(self.graph, [inputs[i] for i in used])
+        kept = [i for i in range(len(given)) if i < len(args) or i in used or i in passed]
+        self._collect = _getter([paths[i - len(args)] for i in kept[len(args) :]])
+        self._inputs = [(kept.index(i), inputs[i].dtype) for i in used]
+        self._passed = [None if source is None else kept.index(source) for source in passed]
 
     def __call__(self, *args: Tensor) -> Any:
-        tensors = (*args, *self._collect(self._owner))
-        inputs = [
-            x if x.dtype == dtype and x.stride() == stride else x.to(dtype).contiguous()
-            for x, (dtype, stride) in zip(tensors, self._kinds, strict=True)
-        ]
-        results = iter(self._kernel(*inputs))
+        given = (*args, *self._collect(self._owner))
+        made = iter(self._kernel(*(_fit(given[i], dtype) for i, dtype in self._inputs)))
+        results = (next(made) if source is None else given[source] for source in self._passed)
         for attribute in self._writes:
             attribute.put(self._owner, results)
         kind, present = self._returned
@@ -184,8 +193,7 @@ class _Replay:
             returned = method(*tensors[:num_args])
             self._returned = type(returned), tuple(value is not None for value in returned)
             written = [attrgetter(path)(self._owner) for attribute in self._writes for path in attribute.paths()]
-        results = [*written, *(value for value in returned if value is not None)]
-        return [x.clone(memory_format=torch.contiguous_format) for x in results]
+        return [*written, *(value for value in returned if value is not None)]
 
     @contextmanager
     def _kept(self) -> Iterator[None]:
@@ -203,7 +211,13 @@ class _Replay:
                 Attribute(attribute.path, None).put(self._owner, iter([value]))
 
 
+def _fit(x: Tensor, dtype: torch.dtype) -> Tensor:
+    """As the kernel was promised it."""
+    return x if x.dtype is dtype and x.is_contiguous() else x.to(dtype).contiguous()
+
+
 def _getter(paths: Sequence[str]) -> Callable[[object], tuple[Any, ...]]:
     """Looks up all these attributes in one call, which for many is far quicker than one by one."""
-    get = attrgetter(*paths)
-    return get if len(paths) > 1 else lambda owner: (get(owner),)
+    if len(paths) > 1:
+        return attrgetter(*paths)
+    return lambda owner: tuple(attrgetter(path)(owner) for path in paths)

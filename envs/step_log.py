@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -24,35 +25,50 @@ def episode_ratio(falls_per_step: Tensor, max_episode_length: int) -> Tensor:
 
 
 class StepLog:
-    """Sums over the steps of an interval, one row per robot."""
+    """Sums over the steps of an interval, which environments keep for themselves until they are asked for."""
 
-    def __init__(self, robot_names: list[str], robot_id: Tensor) -> None:
-        """Start empty for robots of these names; ``robot_id`` is each environment's, shape (N,)."""
-        self._names = robot_names
+    def __init__(
+        self, robot_names: Sequence[str], robot_id: Tensor, terms: Sequence[str], reasons: Sequence[str]
+    ) -> None:
+        """Start empty.
+
+        Args:
+            robot_names: names of the robots.
+            robot_id: each environment's robot, shape (N,).
+            terms: names of the reward terms.
+            reasons: names of what ends episodes.
+        """
+        self._names = tuple(robot_names)
         self._robot_id = robot_id
         counts = torch.bincount(robot_id, minlength=len(robot_names)).to(torch.float64)
         self._num_envs = counts.unsqueeze(1)
         self._cause_codes = torch.arange(1, len(CAUSES) + 1, device=robot_id.device)
-        self._sums: Tensor | None = None
-        self._columns: list[str] = []
-        self._steps = 0
+        self._columns = (
+            *(f"Episode_Reward/{name}" for name in terms),
+            *(f"Episode_Termination/{name}" for name in reasons),
+            *(f"Health/{cause}" for cause in CAUSES),
+            *(f"Metrics/{name}" for name in ERROR_NAMES),
+            *("match", "moving", "falls", "dones"),
+        )
+        self.sums = torch.zeros(len(robot_id), len(self._columns), device=robot_id.device)
+        """Float32, shape (N, columns)."""
 
-    def rows(
+    def add(
         self,
-        terms: dict[str, Tensor],
-        reasons: dict[str, Tensor],
+        terms: Sequence[Tensor],
+        reasons: Sequence[Tensor],
         causes: Tensor,
         errors: Tensor,
         contact_match: Tensor,
         falls: Tensor,
         dones: Tensor,
         standing: Tensor,
-    ) -> Tensor:
-        """What :meth:`add` takes of one step, float64, shape (N, columns).
+    ) -> None:
+        """Add one step.
 
         Args:
-            terms: weighted reward terms by name, shape (N,) each.
-            reasons: what ended episodes, by name, bool, shape (N,) each.
+            terms: weighted reward terms, shape (N,) each.
+            reasons: what ended episodes, bool, shape (N,) each.
             causes: codes of what is wrong with environments, see ``envs.sim.health.CAUSES``, shape (N,).
             errors: tracking errors in the order of ``ERROR_NAMES``, shape (N, 5).
             contact_match: share of feet that agree with the clock, shape (N,).
@@ -60,42 +76,32 @@ class StepLog:
             dones: episodes that ended, bool, shape (N,).
             standing: whether the command is to stand, bool, shape (N,).
         """
-        self._columns = [
-            *(f"Episode_Reward/{name}" for name in terms),
-            *(f"Episode_Termination/{name}" for name in reasons),
-            *(f"Health/{cause}" for cause in CAUSES),
-            *(f"Metrics/{name}" for name in ERROR_NAMES),
-            *("match", "moving", "falls", "dones"),
-        ]
         blocks = (
-            torch.stack(list(terms.values()), dim=1) if terms else errors[:, :0],
-            torch.stack(list(reasons.values()), dim=1),
+            torch.stack(tuple(terms), dim=1) if terms else errors[:, :0],
+            torch.stack(tuple(reasons), dim=1),
             causes.unsqueeze(1) == self._cause_codes,
             errors,
             torch.stack((contact_match.masked_fill(standing, 0.0), ~standing, falls, dones), dim=1),
         )
-        return torch.cat(blocks, dim=1).double()
+        before = self.sums.split([block.shape[1] for block in blocks], dim=1)
+        self.sums = torch.cat([x + block.to(x.dtype) for x, block in zip(before, blocks, strict=True)], dim=1)
 
-    def add(self, rows: Tensor) -> None:
-        """Add one step's :meth:`rows`."""
-        if self._sums is None:
-            self._sums = rows.new_zeros(len(self._names), rows.shape[1])
-        self._sums = self._sums.index_add(0, self._robot_id, rows)
-        self._steps += 1
-
-    def flush(self) -> tuple[dict[str, float], Tensor, Tensor]:
+    def flush(self, num_steps: int) -> tuple[dict[str, float], Tensor, Tensor]:
         """Return the interval's tags, each robot's falls per step (R,) and contact match (R,), and start anew.
 
         Rewards are per second, terminations are shares of the episodes that ended, errors are means over steps, causes
         of sickness are counted, and ``Health/sick_share`` is their sum as a share of the environment steps.
+
+        Args:
+            num_steps: control steps that were added.
         """
-        assert self._sums is not None, "flush follows add"
-        sums = self._sums
+        sums = self._num_envs.new_zeros(len(self._names), len(self._columns))
+        sums.index_add_(0, self._robot_id, self.sums.double())
         counts = Counter(tag.partition("/")[0] for tag in self._columns[:-4])
         kinds = ("Episode_Reward", "Episode_Termination", "Health", "Metrics")
         rewards, terminations, causes, errors, last = sums.split([*(counts[kind] for kind in kinds), 4], dim=1)
         match, moving, falls, dones = last.split(1, dim=1)
-        env_steps = self._num_envs * self._steps
+        env_steps = self._num_envs * num_steps
         match, falls_per_step = match / moving.clamp(min=1.0), falls / env_steps
         table = torch.cat(
             (
@@ -109,27 +115,23 @@ class StepLog:
             ),
             dim=1,
         )
-        self._sums, self._steps = torch.zeros_like(sums), 0
-        entry = dict(zip(_tags(tuple(self._columns), tuple(self._names)), table.flatten().tolist(), strict=True))
+        self.sums = torch.zeros_like(self.sums)
+        entry = dict(zip(_tags(self._columns, self._names), table.flatten().tolist(), strict=True))
         return entry, falls_per_step.squeeze(1), match.squeeze(1)
 
     def state_dict(self) -> dict[str, Any]:
         """The sums of the unfinished interval."""
-        return {
-            "sums": None if self._sums is None else self._sums.clone(),
-            "steps": self._steps,
-            "columns": self._columns,
-        }
+        return {"sums": self.sums.clone()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` returned."""
+        """Restore what :meth:`state_dict` returned; sums by robot, which used to be kept, are dropped."""
         sums: Tensor | None = state["sums"]
-        self._sums = None if sums is None else sums.to(self._robot_id.device)
-        self._steps, self._columns = state["steps"], list(state["columns"])
+        known = sums is not None and sums.shape == self.sums.shape
+        self.sums = sums.to(self.sums, copy=True) if known and sums is not None else torch.zeros_like(self.sums)
 
 
 @lru_cache(maxsize=8)
 def _tags(columns: tuple[str, ...], names: tuple[str, ...]) -> list[str]:
-    """Tags of a flush: what :meth:`StepLog.rows` calls its columns, the last four worked up, for each robot."""
+    """Tags of a flush: how a ``StepLog`` calls its columns, the last four worked up, for each robot."""
     told = (*columns[:-4], "Health/sick_share", "Metrics/contact_match", "Metrics/falls_per_1000_steps")
     return [f"{column}/{name}" for name in names for column in told]

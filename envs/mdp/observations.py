@@ -32,11 +32,14 @@ COLLISION_FORCE = 2.0
 """Contact force above which a link counts as in collision [N] (HugWBC 5)."""
 
 
-def _scaled(columns: list[Tensor], cfg: ObservationsCfg, group: str, first: int = 0) -> Tensor:
-    """Lay columns side by side, scale and bound them; the first is column ``first`` of its group."""
-    x = torch.cat(columns, dim=1)
-    scale = scale_vector(cfg, group, x.dtype, x.device)
-    return x.mul_(scale[first : first + x.shape[1]]).clamp_(-cfg.clip, cfg.clip)
+def _scaled(columns: list[Tensor], cfg: ObservationsCfg, group: str, first: int = 0) -> list[Tensor]:
+    """Scale and bound columns; the first is column ``first`` of its group.
+
+    They are laid side by side afterwards: a kernel writes what is laid side by side before it goes on with it.
+    """
+    widths = [x.shape[1] for x in columns]
+    scale = scale_vector(cfg, group, columns[0].dtype, columns[0].device)[first : first + sum(widths)]
+    return [(x * s).clamp_(-cfg.clip, cfg.clip) for x, s in zip(columns, scale.split(widths), strict=True)]
 
 
 def proprioception(state: PooledState, robots: PooledRobots, cfg: ObservationsCfg) -> Tensor:
@@ -47,7 +50,7 @@ def proprioception(state: PooledState, robots: PooledRobots, cfg: ObservationsCf
     """
     joint_pos_rel = (state.joint_pos - robots.default_joint_pos) * robots.slot_mask
     columns = [state.base_ang_vel_b, state.projected_gravity_b, joint_pos_rel, state.joint_vel]
-    return _scaled([*columns, state.actions] if cfg.last_action else columns, cfg, "history")
+    return torch.cat(_scaled([*columns, state.actions] if cfg.last_action else columns, cfg, "history"), dim=1)
 
 
 def noise_scale(cfg: ObservationsCfg, robots: PooledRobots) -> Tensor:
@@ -67,7 +70,7 @@ def noise_scale(cfg: ObservationsCfg, robots: PooledRobots) -> Tensor:
 
 
 def delay(current: Tensor, previous: Tensor, fraction: Tensor) -> Tensor:
-    """Frame seen through sensors that lag by a fraction of the control step (HugWBC 8).
+    """What sensors that lag by a fraction of the control step say (HugWBC 8).
 
     Args:
         current: newest frame, shape (N, F).
@@ -75,10 +78,9 @@ def delay(current: Tensor, previous: Tensor, fraction: Tensor) -> Tensor:
         fraction: latency over control step, in [0, 1], shape (N, 1).
 
     Returns:
-        The blend of both in the sensed columns, the newest frame in the last action's; shape (N, F).
+        The blend of both in the sensed columns, shape (N, ``SENSED_SIZE``).
     """
-    sensed = torch.lerp(current[:, :SENSED_SIZE], previous[:, :SENSED_SIZE], fraction)
-    return torch.cat((sensed, current[:, SENSED_SIZE:]), dim=1)
+    return torch.lerp(current[:, :SENSED_SIZE], previous[:, :SENSED_SIZE], fraction)
 
 
 class History:
@@ -89,9 +91,14 @@ class History:
         self.frames = frame.new_zeros(num_envs, length, frame.shape[-1])
         """Shape (N, K, F)."""
 
-    def push(self, frame: Tensor) -> None:
-        """Put a frame of shape (N, F) in front and drop the oldest; tensors handed out before keep their values."""
-        self.frames = torch.cat((frame.unsqueeze(1), self.frames[:, :-1]), dim=1)
+    def push(self, *columns: Tensor) -> None:
+        """Put a frame in front and drop the oldest; tensors handed out before keep their values.
+
+        Args:
+            columns: the frame's, side by side F of them, shape (N, ...) each.
+        """
+        kept = self.flat[:, : -self.frames.shape[2]]
+        self.frames = torch.cat((*columns, kept), dim=1).view_as(self.frames)
 
     def reset(self, ids: Tensor, frame: Tensor) -> None:
         """Fill all K frames of some environments with their first frame, shapes (n,) and (n, F) (HugWBC 5)."""
@@ -105,7 +112,8 @@ class History:
 
 def command_observation(state: PooledState, cfg: ObservationsCfg) -> Tensor:
     """Scaled command c_t, shape (N, 5)."""
-    return _scaled([state.command], cfg, "command")
+    (command,) = _scaled([state.command], cfg, "command")
+    return command
 
 
 def clock_observation(state: PooledState, cfg: ObservationsCfg) -> Tensor:
@@ -164,10 +172,10 @@ def critic_observation(
     columns = columns if embodiment is None else [*columns, embodiment]
     if cfg.clock_harmonics:
         columns.append(clock_harmonics(state.foot_phase, cfg.clock_harmonics))
-    return torch.cat((frame, _scaled(columns, cfg, "critic", first=frame.shape[1])), dim=1)
+    return torch.cat((frame, *_scaled(columns, cfg, "critic", first=frame.shape[1])), dim=1)
 
 
 def estimation_target(state: PooledState, embodiment: Tensor | None, cfg: ObservationsCfg) -> Tensor:
     """What the actor's estimator is to recover: scaled base velocity and o_ea, shape (N, 3 + E)."""
     columns = [state.base_lin_vel_b]
-    return _scaled(columns if embodiment is None else [*columns, embodiment], cfg, "estimate")
+    return torch.cat(_scaled(columns if embodiment is None else [*columns, embodiment], cfg, "estimate"), dim=1)

@@ -286,10 +286,10 @@ def compute_rewards(
     """
     shaped_weight = 1.0 + SHAPING_WEIGHT * ctx.gait_shaping
     values: dict[str, Tensor] = {}
-    for name, term in REWARD_TERMS.items():
-        if getattr(ctx.cfg.weights, name) != 0.0:
-            value = ctx.once(term.function, state, robots)
-            values[name] = value * shaped_weight if term.shaped else value
+    for name in terms_in_use(ctx.cfg.weights):
+        term = REWARD_TERMS[name]
+        value = ctx.once(term.function, state, robots)
+        values[name] = value * shaped_weight if term.shaped else value
     if not values:
         return torch.zeros_like(state.base_height), {}
     unweighted = torch.stack(list(values.values()))
@@ -297,8 +297,13 @@ def compute_rewards(
     return weighted.sum(dim=0), dict(zip(values, weighted.unbind(), strict=True))
 
 
+def terms_in_use(weights: RewardWeightsCfg) -> tuple[str, ...]:
+    """Names of the terms whose weight is not zero, in the order of ``REWARD_TERMS``."""
+    return tuple(name for name in REWARD_TERMS if getattr(weights, name) != 0.0)
+
+
 def reward_factors(weights: RewardWeightsCfg, penalty_scale: float, step_dt: float, like: Tensor) -> Tensor:
-    """Factor on each term of non-zero weight, in the order of ``REWARD_TERMS``, shape (T, 1).
+    """Factor on each of :func:`terms_in_use`, shape (T, 1).
 
     Args:
         weights: of the terms.
@@ -313,11 +318,10 @@ def reward_factors(weights: RewardWeightsCfg, penalty_scale: float, step_dt: flo
 def _factors(
     weights: RewardWeightsCfg, penalty_scale: float, step_dt: float, dtype: torch.dtype, device: torch.device
 ) -> Tensor:
-    """Factor on each term of non-zero weight, in the order of ``REWARD_TERMS``, shape (T, 1)."""
+    """See :func:`reward_factors`."""
     factors = [
-        [getattr(weights, name) * step_dt * (penalty_scale if term.curriculum else 1.0)]
-        for name, term in REWARD_TERMS.items()
-        if getattr(weights, name) != 0.0
+        [getattr(weights, name) * step_dt * (penalty_scale if REWARD_TERMS[name].curriculum else 1.0)]
+        for name in terms_in_use(weights)
     ]
     return torch.tensor(factors, dtype=dtype, device=device)
 

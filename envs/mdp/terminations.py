@@ -9,9 +9,12 @@ from eagle_rl.config.schema import TerminationsCfg
 
 from ..state import PooledState
 
+REASONS = ("fall_contact", "roll", "pitch")
+"""Why a robot counts as fallen."""
+
 
 def terminations(state: PooledState, cfg: TerminationsCfg) -> dict[str, Tensor]:
-    """Which robots have fallen, by cause.
+    """Which robots have fallen, by each of ``REASONS``.
 
     Args:
         state: state after the control step.

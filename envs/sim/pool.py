@@ -86,6 +86,7 @@ class PhysicsPool:
         """What MuJoCo wrote in the last step, robot by robot, shape (N, columns of the widest)."""
         self.wild = torch.zeros(self.num_envs, dtype=torch.bool, device=device)
         """Whether the last action was absurd, shape (N,); see :meth:`aim`."""
+        self.any_wild = self.wild.any()
         self.clock = torch.zeros(self.num_envs, dtype=torch.float64, device=device)
         """Of each simulation after the last step [s], shape (N,)."""
         self.causes = torch.zeros(self.num_envs, dtype=torch.long, device=device)
@@ -113,15 +114,15 @@ class PhysicsPool:
 
     def aim(self, targets: Tensor) -> Tensor:
         """Canonical PD targets, see :meth:`step`, as native ones; remembers which of them are no numbers."""
-        native = native_targets(targets, self.conventions)
-        self.wild = ~native.sum(dim=1).isfinite()
-        return native
+        self.wild = ~targets.sum(dim=1).isfinite()
+        self.any_wild = self.wild.any()
+        return native_targets(targets, self.conventions)
 
     def advance(self, targets: Tensor, wrench: Tensor | None = None) -> None:
         """Nothing but physics, under what :meth:`aim` returned; :meth:`stage` follows."""
         native = targets.cpu().numpy()
         forces = None if wrench is None else wrench.to("cpu", torch.float64).numpy()
-        aimed = ~self.wild.cpu().numpy()[:, None] if self.wild.any() else None
+        aimed = ~self.wild.cpu().numpy()[:, None] if self.any_wild else None
         after = self._readings[self._recorder.next()]
 
         def advance(part: int) -> None:
@@ -140,7 +141,9 @@ class PhysicsPool:
         time, robot, of = self.native[:, self._layout.time], self.conventions.robot, self.conventions
         self.causes = diagnose(self.native, of.largest[robot], of.beyond[robot], time > self.clock, self.wild)
         self.clock = time.clone()
-        self.staged = torch.where(self.causes.unsqueeze(1) > 0, self.staged, self._rows(self.native))
+        blocks, sick = self._blocks(self.native), self.causes.unsqueeze(1) > 0
+        before = self.staged.split([block.shape[1] for block in blocks], dim=1)
+        self.staged = torch.cat([torch.where(sick, *pair) for pair in zip(before, blocks, strict=True)], dim=1)
 
     def split(self, ids: Tensor) -> list[tuple[int, Ids, Ids]]:
         """Split sorted pool rows by batch: (batch's index, rows local to it, positions in ``ids``)."""
@@ -238,7 +241,11 @@ class PhysicsPool:
 
     def _rows(self, native: Tensor, ids: Tensor | slice = slice(None)) -> Tensor:
         """Staging rows of some environments, from what MuJoCo wrote of them."""
-        return self._layout.rows(native, self.damping[ids], self.conventions.robot[ids], self.conventions)
+        return torch.cat(self._blocks(native, ids), dim=1)
+
+    def _blocks(self, native: Tensor, ids: Tensor | slice = slice(None)) -> list[Tensor]:
+        """The same, block by block."""
+        return self._layout.blocks(native, self.damping[ids], self.conventions.robot[ids], self.conventions)
 
     def _read(self) -> None:
         """Take what MuJoCo wrote last for the latest."""

@@ -85,8 +85,8 @@ class Staging:
             beyond=torch.from_numpy(np.stack([beyond for _, beyond in judged])).to(device),
         )
 
-    def rows(self, native: Tensor, damping: Tensor, robot: Tensor, conventions: Conventions) -> Tensor:
-        """Staging rows, shape (n, columns).
+    def blocks(self, native: Tensor, damping: Tensor, robot: Tensor, conventions: Conventions) -> list[Tensor]:
+        """Staging rows, shape (n, columns), as blocks of columns to be laid side by side.
 
         The torque is that of the last physics step: clipped kp * error minus kd * velocity [N m].
 
@@ -102,7 +102,7 @@ class Staging:
         canonical = (position - conventions.zero_offsets[robot], velocity, force - damping * velocity)
         in_slots = [conventions.signs[robot] * x for x in canonical]
         blocks = (native[:, self._root], moving, *in_slots, native[:, self._sensors])
-        return torch.cat([block.to(self._dtype) for block in blocks], dim=1)
+        return [block.to(self._dtype) for block in blocks]
 
     def _source(self, batch: RobotBatch) -> NDArray[np.int64]:
         """A row of ``Conventions.source``."""
