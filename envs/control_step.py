@@ -13,7 +13,7 @@ from eagle_rl.config.schema import TaskCfg
 from .ground import Plane
 from .mdp.active_commands import ActiveCommands
 from .mdp.aids import harness_wrench
-from .mdp.commands import DrawnCommands
+from .mdp.commands import DrawnCommands, is_standing
 from .mdp.gait import advance_phase, foot_phases
 from .mdp.layout import SENSED_SIZE
 from .mdp.metrics import contact_match, measured_commands, tracking_errors
@@ -39,7 +39,7 @@ from .state import PooledRobots, PooledState
 from .step_log import StepLog
 
 BLOCK = 8
-"""Environments whose new episodes a kernel draws at a time; more at once are drawn without."""
+"""Environments that a kernel resets at a time."""
 
 
 class Judgement(NamedTuple):
@@ -76,6 +76,25 @@ class DerivedGroups(NamedTuple):
     clock: Tensor
     critic: Tensor
     estimate: Tensor
+
+
+class Sight(NamedTuple):
+    """What a reset or a new command changes in what is observed, a row for each of some environments."""
+
+    staged: Tensor
+    """Staging rows."""
+    frame: Tensor
+    """Clean, see ``proprioception``."""
+    command: Tensor
+    """What follows are the fields of ``DerivedGroups``."""
+    clock: Tensor
+    critic: Tensor
+    estimate: Tensor
+
+    @property
+    def groups(self) -> DerivedGroups:
+        """The observation groups."""
+        return DerivedGroups(self.command, self.clock, self.critic, self.estimate)
 
 
 class Episode(NamedTuple):
@@ -152,7 +171,7 @@ class ControlStep:
     def state(self) -> PooledState:
         """What every robot did in the last step, under the command now in force; worked out when it is asked for."""
         if self._state is None:
-            self._state = self._derive()
+            self._state = self._derive(self.pool.staged)
         return self._state
 
     @property
@@ -217,18 +236,27 @@ class ControlStep:
 
     def _derive_groups(self) -> DerivedGroups:
         """The observation groups that are worked out from the present state."""
-        cfg, state, friction = self.task.observations, self.state, self.task.randomization.friction
+        return self._groups_of(self.state, self.robots, self.embodiment, self._last_frame)
+
+    def _groups_of(
+        self, state: PooledState, robots: PooledRobots, embodiment: Tensor | None, frame: Tensor
+    ) -> DerivedGroups:
+        """The observation groups of robots in these states whose clean frames are these."""
+        cfg, friction = self.task.observations, self.task.randomization.friction
         return DerivedGroups(
             command_observation(state, cfg).float(),
             clock_observation(state, cfg).float(),
-            critic_observation(self._last_frame, state, self.robots, self.embodiment, cfg, friction).float(),
-            estimation_target(state, self.embodiment, cfg).float(),
+            critic_observation(frame, state, robots, embodiment, cfg, friction).float(),
+            estimation_target(state, embodiment, cfg).float(),
         )
 
-    def _look(self) -> DerivedGroups:
-        """Observe robots that a reset has moved: their frame and the groups."""
-        (self._last_frame,) = self._sense()
-        return self._derive_groups()
+    def _look(self, ids: Tensor) -> Sight:
+        """See anew some environments, shape (n,), whose robots or commands have changed; nothing is written."""
+        staged, robots = self.pool.staging_rows(ids), self.robots.rows(ids)
+        state = self._derive(staged, ids)
+        frame = proprioception(state, robots, self.task.observations)
+        embodiment = None if self.embodiment is None else self.embodiment[ids]
+        return Sight(staged, frame, *self._groups_of(state, robots, embodiment, frame))
 
     def _begin(self, ids: Tensor) -> Episode:
         """Draw how new episodes of some environments, shape (n,), begin; nothing changes."""
@@ -251,21 +279,23 @@ class ControlStep:
         self._last_frame = frame
         self.history.push(sensed, frame[:, SENSED_SIZE:])
 
-    def _derive(self) -> PooledState:
-        """Turn the staging rows into the pooled state, with the command, phase and actions now in force."""
-        physical, standing = measured(self.pool.staged, self.pool.columns), self.commands.standing
+    def _derive(self, staged: Tensor, ids: Tensor | slice = slice(None)) -> PooledState:
+        """The state of some environments by their staging rows, with the command, phase and actions now in force."""
+        physical = measured(staged, self.pool.columns)
+        command = self.command[ids]
+        standing = is_standing(command)
         return PooledState(
             **physical,
             **self.ground.measure(physical["root_pos_w"], physical["root_quat_w"], physical["foot_pos_w"]),
-            joint_acc=(physical["joint_vel"] - self._last_joint_vel) / self.step_dt,
-            last_foot_contact=self._last_contact,
-            friction=self.randomizer.friction,
-            command=self.command,
+            joint_acc=(physical["joint_vel"] - self._last_joint_vel[ids]) / self.step_dt,
+            last_foot_contact=self._last_contact[ids],
+            friction=self.randomizer.friction[ids],
+            command=command,
             standing=standing,
-            foot_phase=foot_phases(self.phase, standing, self.task.gait),
-            actions=self._actions,
-            last_actions=self._last_actions,
-            last_last_actions=self._last_last_actions,
+            foot_phase=foot_phases(self.phase[ids], standing, self.task.gait),
+            actions=self._actions[ids],
+            last_actions=self._last_actions[ids],
+            last_last_actions=self._last_last_actions[ids],
         )
 
     def _forget(self) -> None:
@@ -298,7 +328,7 @@ _PARTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ),
     ),
     "_derive_groups": ((*_STATE, "_last_frame", "embodiment"), ()),
-    "_look": ((*_STATE, "embodiment"), ("_last_frame",)),
+    "_look": ((*_STATE, "pool.native", "pool.damping", "pool.conventions", "embodiment"), ()),
     "_begin": (
         (
             *("randomizer.robots", "episode_count", "randomizer.reset_keys", "randomizer.start_keys"),
@@ -325,12 +355,13 @@ def compile_step(env: ControlStep) -> None:
         recording = Recording(env, getattr(env, name), (*reads, *read), (*writes, *written), ("_state",))
         recording.make(*_EXAMPLES.get(name, lambda _: ())(env))
         recordings[name] = recording
-    begin = InBlocks(recordings["_begin"], env._begin, BLOCK)
-    vars(env).update(recordings | {"_begin": begin})
+    some = {name: InBlocks(recordings[name], getattr(env, name), BLOCK) for name in ("_begin", "_look")}
+    vars(env).update(recordings | some)
 
 
 _EXAMPLES: dict[str, Callable[[ControlStep], tuple[Tensor, ...]]] = {
     "_aim": lambda env: (torch.zeros_like(env._actions, dtype=torch.float32),),
     "_begin": lambda env: (torch.zeros(BLOCK, dtype=torch.long, device=env.device),),
+    "_look": lambda env: (torch.zeros(BLOCK, dtype=torch.long, device=env.device),),
 }
 """Arguments of those parts that have some."""

@@ -17,7 +17,7 @@ from torch import Tensor
 from eagle_rl.config.schema import TaskCfg
 from eagle_rl.errors import CompileError, EagleWarning
 
-from .control_step import ControlStep, compile_step
+from .control_step import ControlStep, Sight, compile_step
 from .ground import make_ground
 from .mdp.active_commands import ActiveCommands
 from .mdp.aids import LearningAids, harness_damping
@@ -202,6 +202,8 @@ class HumanoidEnv(ControlStep, VecEnv):
 
     def reset(self) -> None:
         """Start new episodes everywhere; random streams go on."""
+        self._forget()
+        self.pool.staged = self.pool.staged.clone()  # what was handed out keeps its values
         self._reset(self._all, torch.zeros_like(self._all, dtype=torch.bool))
 
     def get_observations(self) -> TensorDict:
@@ -269,7 +271,7 @@ class HumanoidEnv(ControlStep, VecEnv):
         begun = self._begin(ids)
         if begun.draws is not None:
             self.randomizer.put(ids, begun.draws)
-        staged = self.pool.reset(ids, self.ground.place(ids, count, begun.root), begun.joint_pos, begun.joint_vel)
+        self.pool.place(ids, self.ground.place(ids, count, begun.root), begun.joint_pos, begun.joint_vel)
         self.episode_count[ids] += 1
         self.episode_length_buf = self.episode_length_buf.index_fill(0, ids, 0)
         self.phase = self.phase.index_fill(0, ids, 0.0)
@@ -277,17 +279,26 @@ class HumanoidEnv(ControlStep, VecEnv):
         self.posture.reset(ids)
         for name in ("_actions", "_last_actions", "_last_last_actions", "_last_contact"):
             setattr(self, name, getattr(self, name).index_fill(0, ids, 0))
-        self._last_joint_vel = self._last_joint_vel.index_copy(0, ids, staged[:, self.pool.columns["joint_vel"]])
-        self._forget()
-        self._groups = self._look()
-        self.history.reset(ids, self._last_frame[ids])
+        seen = self._see(ids)
+        self.pool.restage(ids, seen.staged)
+        self._last_joint_vel = self._last_joint_vel.index_copy(0, ids, seen.staged[:, self.pool.columns["joint_vel"]])
+        self._last_frame[ids] = seen.frame
+        self.history.reset(ids, seen.frame)
+
+    def _see(self, ids: Tensor) -> Sight:
+        """Observe some environments anew, shape (n,); the others are observed as they were."""
+        self._state = None
+        seen = self._look(ids)
+        for group, rows in zip(self._groups or (), seen.groups, strict=False):
+            group[ids] = rows
+        return seen
 
     def _resample(self) -> None:
         """Draw new commands where their time is still up after resets."""
         ids = self.commands.due().nonzero().squeeze(1)
         if len(ids):
             self.commands.draw(ids)
-            self._forget()
+            self._see(ids)
 
     def _account(self) -> dict[str, Tensor | float]:
         """Now and then, let the aids see how it went; returns tags and values then."""

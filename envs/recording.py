@@ -113,10 +113,13 @@ class Recording:
 
 
 class InBlocks:
-    """Stands in for a method of any number of rows, up to a block at a time by its recording for just that number."""
+    """Stands in for a method of any number of rows: its recording for so many, as often as it takes."""
+
+    MOST = 8
+    """Blocks; of more rows at once the method itself is the quicker."""
 
     def __init__(self, recording: Recording, method: Callable[[Tensor], Any], size: int) -> None:
-        """Use ``recording`` of ``method`` for up to ``size`` rows, whose results are tuples of tensors."""
+        """Use ``recording`` of ``method`` for ``size`` rows, whose results are tuples of tensors."""
         self.graphs = recording.graphs
         self._recording, self._method = recording, method
         self._size = size
@@ -124,9 +127,17 @@ class InBlocks:
 
     def __call__(self, ids: Tensor) -> Any:
         """Do what the method does."""
-        count = len(ids)
-        if count > self._size:
+        if not 0 < len(ids) <= self._size * self.MOST:
             return self._method(ids)
+        blocks = [self._block(block) for block in ids.split(self._size)]
+        if len(blocks) == 1:
+            return blocks[0]
+        results = (None if parts[0] is None else torch.cat(parts) for parts in zip(*blocks, strict=True))
+        return type(blocks[0])(*results)
+
+    def _block(self, ids: Tensor) -> Any:
+        """Of up to so many rows."""
+        count = len(ids)
         if count not in self._fill:
             self._fill[count] = torch.arange(self._size, device=ids.device).clamp(max=count - 1)
         results = self._recording(ids[self._fill[count]])

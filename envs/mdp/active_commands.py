@@ -30,11 +30,6 @@ class ActiveCommands:
         """(v_x, v_y, omega, h, p), shape (N, 5)."""
         self._pinned: Tensor | None = None
 
-    @property
-    def standing(self) -> Tensor:
-        """Whether all three velocity commands are zero, bool, shape (N,) (HugWBC 1)."""
-        return (self.command[:, :3] == 0).all(dim=1)
-
     def pin(self, command: Tensor | None) -> None:
         """Hold these commands, shape (N, 5), instead of sampling; ``None`` returns to sampling at the next draw."""
         self._pinned = None if command is None else command.to(self.command, copy=True)
@@ -67,6 +62,8 @@ class ActiveCommands:
 
     def _begin(self, ids: Tensor, drawn: DrawnCommands) -> None:
         """Put commands in force, unless others are pinned."""
+        if not len(ids):
+            return
         self.age[ids] = 0
         if self._pinned is None:
             self.sampler.open(ids, drawn)

@@ -122,7 +122,7 @@ class CommandSampler:
 
     def close(self, ids: Tensor) -> None:
         """Close the windows of some environments, shape (n,): what succeeded widens the grid."""
-        if self.cfg.curriculum.enabled:
+        if self.cfg.curriculum.enabled and len(ids):
             self._credit(ids)
 
     def open(self, ids: Tensor, drawn: DrawnCommands) -> None:
@@ -195,3 +195,8 @@ class CommandSampler:
             "Curriculum/command_bins_open_min": is_open.min().item(),
             "Curriculum/command_weight": self.weights.mean().item(),
         }
+
+
+def is_standing(command: Tensor) -> Tensor:
+    """Whether all three velocity commands are zero, bool, shape (N,), for commands (N, 5) (HugWBC 1)."""
+    return (command[:, :3] == 0).all(dim=1)

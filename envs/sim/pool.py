@@ -94,7 +94,7 @@ class PhysicsPool:
         damping = [np.tile(batch.spec.to_slots(batch.spec.damping), (batch.num_envs, 1)) for batch in self.batches]
         self.damping = torch.from_numpy(np.concatenate(damping)).to(device)
         """kd in force, in slots [N m s/rad], shape (N, 32)."""
-        self.staged = self._rows(self.native)
+        self.staged = torch.cat(self._blocks(self.native), dim=1)
         """Staging rows, see :func:`staging_columns`, shape (N, columns); a new tensor at each step. Rows of sick
         environments stay as they were in the step before, so that nothing that is not finite gets out."""
 
@@ -158,8 +158,8 @@ class PhysicsPool:
             self._split = ids, parts
         return self._split[1]
 
-    def reset(self, ids: Tensor, root: Tensor, joint_pos: Tensor, joint_vel: Tensor) -> Tensor:
-        """Write states and return the new staging rows.
+    def place(self, ids: Tensor, root: Tensor, joint_pos: Tensor, joint_vel: Tensor) -> None:
+        """Write states; :meth:`staging_rows` are what to :meth:`restage` then.
 
         Args:
             ids: sorted pool rows, shape (n,).
@@ -176,9 +176,23 @@ class PhysicsPool:
             batch.reset(local, qpos, qvel)
             batch.read(self._recorder.latest[self.rows[part]], local)
         self._recorder.forget(ids.cpu().numpy())
-        rows = self._rows(self._recorder.tensor[ids.cpu()].to(self.device), ids)
-        self.staged = self.staged.index_copy(0, ids, rows)
-        self.clock = self.clock.index_fill(0, ids, 0.0)
+        if self.device.type != "cpu":  # else it is the same memory
+            self.native[ids] = self._recorder.tensor[ids.cpu()].to(self.device)
+
+    def staging_rows(self, ids: Tensor) -> Tensor:
+        """Staging rows of some environments, shape (n,), by what MuJoCo wrote of them; nothing is written."""
+        return torch.cat(self._blocks(self.native[ids], ids), dim=1)
+
+    def restage(self, ids: Tensor, rows: Tensor) -> None:
+        """Let these be the staging rows of some environments, shape (n,), whose episodes begin; written in place."""
+        self.staged[ids] = rows
+        self.clock[ids] = 0.0
+
+    def reset(self, ids: Tensor, root: Tensor, joint_pos: Tensor, joint_vel: Tensor) -> Tensor:
+        """:meth:`place` and :meth:`restage`; returns the new staging rows."""
+        self.place(ids, root, joint_pos, joint_vel)
+        self.staged, rows = self.staged.clone(), self.staging_rows(ids)
+        self.restage(ids, rows)
         return rows
 
     def push(self, ids: Tensor, lin_vel_w: Tensor, ang_vel_b: Tensor) -> None:
@@ -239,12 +253,8 @@ class PhysicsPool:
                 cause = CAUSES[causes[row] - 1]
                 self.batches[part].fault(env, cause, self._recorder.last(row)).save(self.fault_folder)
 
-    def _rows(self, native: Tensor, ids: Tensor | slice = slice(None)) -> Tensor:
-        """Staging rows of some environments, from what MuJoCo wrote of them."""
-        return torch.cat(self._blocks(native, ids), dim=1)
-
     def _blocks(self, native: Tensor, ids: Tensor | slice = slice(None)) -> list[Tensor]:
-        """The same, block by block."""
+        """Staging rows of some environments, from what MuJoCo wrote of them, as blocks of columns."""
         return self._layout.blocks(native, self.damping[ids], self.conventions.robot[ids], self.conventions)
 
     def _read(self) -> None:

@@ -150,7 +150,7 @@ def test_a_mirrored_step_ends_in_the_mirrored_state_with_the_same_reward(
     assert_mirrored(env.state, env, tolerance)
     seen: list[PooledState] = []
     derive = env._derive
-    env._derive = lambda: seen.append(derive()) or seen[-1]  # type: ignore[method-assign]
+    env._derive = lambda *rows: seen.append(derive(*rows)) or seen[-1]  # type: ignore[method-assign]
     observations, rewards, dones, _ = env.step(command)
     env._derive = derive  # type: ignore[method-assign]
     state = seen[0]

@@ -117,16 +117,17 @@ class Lottery:
 
 
 @pytest.mark.usefixtures("uncompiled")
-@pytest.mark.parametrize("count", [1, 2, 3, 4])
+@pytest.mark.parametrize("count", [0, 1, 2, 3, 4, 7, 16, 17])
 def test_a_recording_in_blocks_returns_as_many_rows_as_are_asked_for(count: int) -> None:
-    lottery, ids = Lottery(), torch.tensor([7, 2, 5, 9])[:count]
+    lottery, ids = Lottery(), torch.arange(17).flip(0)[:count] % 10
     recording = Recording(lottery, lottery.draw, ("prizes",))
-    recording.make(torch.zeros(3, dtype=torch.long))
-    draw, recorded = InBlocks(recording, lottery.draw, 3), lottery.calls
+    recording.make(torch.zeros(2, dtype=torch.long))
+    draw, recorded = InBlocks(recording, lottery.draw, 2), lottery.calls
     drawn = draw(ids)
     assert drawn.total.tolist() == [2.0 * i for i in ids.tolist()]
     assert drawn.scaled is None
-    assert lottery.calls - recorded == (count > 3), "more rows than a block are left to the method, fewer are not"
+    left = not 0 < count <= 2 * InBlocks.MOST
+    assert lottery.calls - recorded == left, "more rows than so many blocks are left to the method, fewer are not"
 
 
 @pytest.mark.usefixtures("uncompiled")
