@@ -35,7 +35,7 @@ from .recording import InBlocks, Recording
 from .rng import CounterRng
 from .sim.health import MAX_ACTION
 from .sim.pool import PhysicsPool
-from .state import PooledRobots, PooledState
+from .state import PooledRobots, PooledState, carries
 from .step_log import StepLog
 
 BLOCK = 8
@@ -157,13 +157,12 @@ class ControlStep:
     _gait_shaping: Tensor
     _reward_factors: Tensor
     _noise: Tensor
+    """Of each robot, shape (R, F), see ``noise_scale``."""
     _noise_keys: Tensor
     _last_frame: Tensor
     _actions: Tensor
     _last_actions: Tensor
     _last_last_actions: Tensor
-    _last_joint_vel: Tensor
-    _last_contact: Tensor
     _state: PooledState | None
     _groups: DerivedGroups | None
 
@@ -171,7 +170,7 @@ class ControlStep:
     def state(self) -> PooledState:
         """What every robot did in the last step, under the command now in force; worked out when it is asked for."""
         if self._state is None:
-            self._state = self._derive(self.pool.staged)
+            self._state = self._derive(self.pool.staged, self.pool.staged_before)
         return self._state
 
     @property
@@ -191,7 +190,6 @@ class ControlStep:
 
     def _aim(self, actions: Tensor) -> tuple[Tensor, Tensor | None]:
         """Native PD targets, (N, most joints), and the harness' wrench on the bases, (N, 6), or None without one."""
-        self._last_joint_vel, self._last_contact = self.state.joint_vel, self.state.foot_contact
         targets = self.pool.aim(self._act(actions))
         harness = self._harness
         return targets, None if harness is None else harness_wrench(self.state, self.robots, harness).double()
@@ -209,7 +207,7 @@ class ControlStep:
     def _judge(self) -> Judgement:
         """Stage what physics wrote, derive the new state, see what came of the step and what is sensed of it."""
         self.pool.stage()
-        self.episode_length_buf = self.episode_length_buf + 1
+        self.episode_length_buf, self._step_count = self.episode_length_buf + 1, self._step_count + 1
         self.phase = advance_phase(self.phase, self.step_dt, self.robots.gait_frequency)
         state, task, robots, causes = self.state, self.task, self.robots, self.pool.causes
         sick = causes > 0
@@ -253,7 +251,7 @@ class ControlStep:
     def _look(self, ids: Tensor) -> Sight:
         """See anew some environments, shape (n,), whose robots or commands have changed; nothing is written."""
         staged, robots = self.pool.staging_rows(ids), self.robots.rows(ids)
-        state = self._derive(staged, ids)
+        state = self._derive(staged, staged, ids)
         frame = proprioception(state, robots, self.task.observations)
         embodiment = None if self.embodiment is None else self.embodiment[ids]
         return Sight(staged, frame, *self._groups_of(state, robots, embodiment, frame))
@@ -275,20 +273,26 @@ class ControlStep:
         sensed = delay(frame, self._last_frame, self.randomizer.latency)
         if self.task.observations.enable_corruption:
             u = self.rng.uniform_in(-1.0, 1.0, self._noise_keys, self._step_count, SENSED_SIZE)
-            sensed = sensed.addcmul(u.to(frame.dtype), self._noise[:, :SENSED_SIZE])
+            sensed = sensed.addcmul(u.to(frame.dtype), self._noise[self.robots.robot_id, :SENSED_SIZE])
         self._last_frame = frame
         self.history.push(sensed, frame[:, SENSED_SIZE:])
 
-    def _derive(self, staged: Tensor, ids: Tensor | slice = slice(None)) -> PooledState:
-        """The state of some environments by their staging rows, with the command, phase and actions now in force."""
-        physical = measured(staged, self.pool.columns)
+    def _derive(self, staged: Tensor, before: Tensor, ids: Tensor | slice = slice(None)) -> PooledState:
+        """The state of some environments, with the command, phase and actions now in force.
+
+        Args:
+            staged: their staging rows, shape (n, columns).
+            before: the same one step earlier.
+            ids: the environments, shape (n,).
+        """
+        physical, earlier = (measured(rows, self.pool.columns) for rows in (staged, before))
         command = self.command[ids]
         standing = is_standing(command)
         return PooledState(
             **physical,
             **self.ground.measure(physical["root_pos_w"], physical["root_quat_w"], physical["foot_pos_w"]),
-            joint_acc=(physical["joint_vel"] - self._last_joint_vel[ids]) / self.step_dt,
-            last_foot_contact=self._last_contact[ids],
+            joint_acc=(physical["joint_vel"] - earlier["joint_vel"]) / self.step_dt,
+            last_foot_contact=carries(earlier["foot_force_w"]),
             friction=self.randomizer.friction[ids],
             command=command,
             standing=standing,
@@ -304,7 +308,7 @@ class ControlStep:
 
 
 _STATE = (
-    *("pool.staged", "_last_joint_vel", "_last_contact", "_actions", "_last_actions", "_last_last_actions", "phase"),
+    *("pool.staged", "pool.staged_before", "_actions", "_last_actions", "_last_last_actions", "phase"),
     *("commands.command", "randomizer.friction", "robots"),
 )
 """What ``HumanoidEnv.state`` is made of."""
@@ -313,7 +317,7 @@ _FOLLOWED = ("commands.age", "commands.sampler.sums", "step_log.sums")
 _PARTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "_aim": (
         (*_STATE, "randomizer.motor_offset", "_live", "_harness", "pool.conventions"),
-        (*_ACTIONS, "_last_joint_vel", "_last_contact", "pool.wild", "pool.any_wild"),
+        (*_ACTIONS, "pool.wild", "pool.any_wild"),
     ),
     "_judge": (
         (
@@ -323,8 +327,8 @@ _PARTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             *("_step_count", "_noise", "_noise_keys", "_gait_shaping", "_reward_factors", *_FOLLOWED),
         ),
         (
-            *("pool.staged", "pool.causes", "pool.clock", "episode_length_buf", "phase", "_last_frame"),
-            *("history.frames", *_FOLLOWED),
+            *("pool.staged", "pool.staged_before", "pool.causes", "pool.clock", "episode_length_buf", "phase"),
+            *("_last_frame", "_step_count", "history.frames", *_FOLLOWED),
         ),
     ),
     "_derive_groups": ((*_STATE, "_last_frame", "embodiment"), ()),

@@ -110,12 +110,12 @@ class HumanoidEnv(ControlStep, VecEnv):
 
     def _make_task(self, robots: Sequence[RobotSpec], terrain: Terrain | None, dtype: torch.dtype) -> None:
         """What the robots are asked for, stand on and are told, and how it looks in a mirror."""
-        task, dt, observations = self.task, self.step_dt, self.task.observations
+        task, dt, observations, device = self.task, self.step_dt, self.task.observations, self.device
         sampler = CommandSampler(task.commands, self.robots, len(robots), self.rng, dt)
         self.commands = ActiveCommands(sampler, round(task.commands.resampling_time_s / dt), dtype)
-        self.aids = LearningAids(task.aids, len(robots), self.device)
+        self.aids = LearningAids(task.aids, len(robots), device)
         self.posture = make_posture(task.control, robots, self.robots, dt)
-        points = scan_points(observations).to(self.device, dtype)
+        points = scan_points(observations).to(device, dtype)
         self.ground = make_ground(terrain, points, self.robots.robot_id, self.rng, dt, self.max_episode_length)
         self.step_log = StepLog(self.robot_names, self.robots.robot_id, terms_in_use(task.rewards.weights), REASONS)
         self.embodiment = (
@@ -124,8 +124,9 @@ class HumanoidEnv(ControlStep, VecEnv):
             else None
         )
         self.layout = ObservationLayout(observations)
-        self.mirror = self.layout.mirror(self.device)
-        self._noise, self._noise_keys = noise_scale(observations, self.robots), self.rng.keys("observation_noise")
+        self.mirror = self.layout.mirror(device)
+        first_of_each = self.robots.rows(torch.searchsorted(self.robots.robot_id, torch.arange(len(robots)).to(device)))
+        self._noise, self._noise_keys = noise_scale(observations, first_of_each), self.rng.keys("observation_noise")
 
     def _allocate(self, dtype: torch.dtype) -> None:
         """Buffers that outlive a step."""
@@ -138,9 +139,8 @@ class HumanoidEnv(ControlStep, VecEnv):
         self.episode_count = torch.zeros(n, dtype=torch.long, device=device)
         self.phase = torch.zeros(n, dtype=dtype, device=device)
         zeros = torch.zeros(n, NUM_SLOTS, dtype=dtype, device=device)
-        self._actions = self._last_actions = self._last_last_actions = self._last_joint_vel = zeros
-        self._last_contact = torch.zeros(n, 2, dtype=torch.bool, device=device)
-        self._reward_factors = self._weigh()
+        self._actions = self._last_actions = self._last_last_actions = zeros
+        self._weigh()
         self._compile_at: int | None = None
         self._forget()
         (self._last_frame,) = self._sense()
@@ -168,8 +168,8 @@ class HumanoidEnv(ControlStep, VecEnv):
                 warnings.warn(f"{error} Training goes on without, a little slower.", EagleWarning, stacklevel=2)
         self._physics_step(*self._aim(actions))
         self.common_step_counter += 1
-        self._step_count.fill_(self.common_step_counter)
-        self._reward_factors = self._weigh()
+        if self.common_step_counter % self.task.rewards.penalty_interval_steps == 0:
+            self._weigh()
         self._forget()
         judged = self._judge()
         dones, time_outs, self._groups = judged.dones, judged.time_outs, judged.groups
@@ -242,9 +242,9 @@ class HumanoidEnv(ControlStep, VecEnv):
         ids = where.nonzero().squeeze(1)
         return {"final_ids": ids, "final_observations": self.get_observations()[ids]}
 
-    def _weigh(self) -> Tensor:
-        """Factor on each reward term in this step, shape (T, 1)."""
-        return reward_factors(self.task.rewards.weights, self.penalty_scale, self.step_dt, self.phase)
+    def _weigh(self) -> None:
+        """Weight the reward terms as the penalties' curriculum has it."""
+        self._reward_factors = reward_factors(self.task.rewards.weights, self.penalty_scale, self.step_dt, self.phase)
 
     def _physics_step(self, targets: Tensor, wrench: Tensor | None) -> None:
         """Push, help and step every robot."""
@@ -277,11 +277,10 @@ class HumanoidEnv(ControlStep, VecEnv):
         self.phase = self.phase.index_fill(0, ids, 0.0)
         self.commands.renew(ids, fallen, begun.commands)
         self.posture.reset(ids)
-        for name in ("_actions", "_last_actions", "_last_last_actions", "_last_contact"):
+        for name in ("_actions", "_last_actions", "_last_last_actions"):
             setattr(self, name, getattr(self, name).index_fill(0, ids, 0))
         seen = self._see(ids)
         self.pool.restage(ids, seen.staged)
-        self._last_joint_vel = self._last_joint_vel.index_copy(0, ids, seen.staged[:, self.pool.columns["joint_vel"]])
         self._last_frame[ids] = seen.frame
         self.history.reset(ids, seen.frame)
 
@@ -315,10 +314,7 @@ class HumanoidEnv(ControlStep, VecEnv):
 
     # --- exact resume -------------------------------------------------------------------------------------------------
 
-    _BUFFERS = (
-        "episode_length_buf episode_count phase _actions _last_actions _last_last_actions _last_joint_vel "
-        "_last_contact _last_frame"
-    ).split()
+    _BUFFERS = "episode_length_buf episode_count phase _actions _last_actions _last_last_actions _last_frame".split()
 
     _PARTS = ("randomizer", "pool", "commands", "posture", "ground", "aids", "step_log")
     """What has a state of its own; randomization first, because the physics is recomputed under it."""
@@ -334,8 +330,10 @@ class HumanoidEnv(ControlStep, VecEnv):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`state_dict` returned, in an environment built from the same configuration and seed."""
         self.common_step_counter = state["common_step_counter"]
-        for name, value in state["buffers"].items():
-            setattr(self, name, value.to(self.device, copy=True))
+        self._step_count = torch.full_like(self._step_count, self.common_step_counter)
+        self._weigh()
+        for name in self._BUFFERS:
+            setattr(self, name, state["buffers"][name].to(self.device, copy=True))
         self.history.frames = state["history"].to(self.device, copy=True)
         for name in self._PARTS:
             getattr(self, name).load_state_dict(state[name])

@@ -16,6 +16,11 @@ from typing_extensions import Self
 from .geometry import heading_of
 
 
+def carries(foot_force_w: Tensor) -> Tensor:
+    """Whether feet carry more than 1 N, bool, shape (N, 2), by the force on each [N], shape (N, 2, 3)."""
+    return foot_force_w[..., 2] > 1.0
+
+
 @dataclass(kw_only=True)
 class _Rows:
     """A dataclass of tensors that share their first dimension."""
@@ -112,7 +117,7 @@ class PooledState(_Rows):
     @cached_property
     def foot_contact(self) -> Tensor:
         """Whether each foot carries more than 1 N, bool, shape (N, 2)."""
-        return self.foot_force_w[..., 2] > 1.0
+        return carries(self.foot_force_w)
 
     @cached_property
     def base_pitch(self) -> Tensor:

@@ -53,7 +53,7 @@ class RobotBatch:
         self.actuator_force: Array = self._batch.bind("actuator_force")
         self.sensordata: Array = self._batch.bind("sensordata")
         sizes = {"status": 1, "warning": self._batch.warning.shape[1], "sensordata": model.nsensordata, "time": 1}
-        sizes |= {"qpos": model.nq, "qvel": model.nv, "ctrl": model.nu, "actuator_force": model.nu}
+        sizes |= {"qpos": model.nq, "qvel": model.nv, "actuator_force": model.nu, "ctrl": model.nu}
         self.columns = consecutive(sizes)
         """Where everything lies in a row of :meth:`read`; up to ``qpos`` it is the same for every robot."""
         self.width = sum(sizes.values())

@@ -97,6 +97,8 @@ class PhysicsPool:
         self.staged = torch.cat(self._blocks(self.native), dim=1)
         """Staging rows, see :func:`staging_columns`, shape (N, columns); a new tensor at each step. Rows of sick
         environments stay as they were in the step before, so that nothing that is not finite gets out."""
+        self.staged_before = self.staged
+        """The same one step earlier; as they are now where an episode has just begun."""
 
     def step(self, targets: Tensor, wrench: Tensor | None = None) -> Tensor:
         """Advance one control step.
@@ -139,10 +141,11 @@ class PhysicsPool:
     def stage(self) -> None:
         """Judge what MuJoCo wrote in a step, and stage the rows of those who are well."""
         time, robot, of = self.native[:, self._layout.time], self.conventions.robot, self.conventions
-        self.causes = diagnose(self.native, of.largest[robot], of.beyond[robot], time > self.clock, self.wild)
+        self.causes = diagnose(self.native[:, : self._layout.judged], of.largest[robot], of.beyond[robot], time > self.clock, self.wild)
         self.clock = time.clone()
         blocks, sick = self._blocks(self.native), self.causes.unsqueeze(1) > 0
         before = self.staged.split([block.shape[1] for block in blocks], dim=1)
+        self.staged_before = self.staged
         self.staged = torch.cat([torch.where(sick, *pair) for pair in zip(before, blocks, strict=True)], dim=1)
 
     def split(self, ids: Tensor) -> list[tuple[int, Ids, Ids]]:
@@ -186,6 +189,7 @@ class PhysicsPool:
     def restage(self, ids: Tensor, rows: Tensor) -> None:
         """Let these be the staging rows of some environments, shape (n,), whose episodes begin; written in place."""
         self.staged[ids] = rows
+        self.staged_before = self.staged_before.index_copy(0, ids, rows)
         self.clock[ids] = 0.0
 
     def reset(self, ids: Tensor, root: Tensor, joint_pos: Tensor, joint_vel: Tensor) -> Tensor:
@@ -230,6 +234,7 @@ class PhysicsPool:
                 torch.from_numpy(np.concatenate([batch.state() for batch in batches])) for batches in self._of_robots
             ],
             "staging": self.staged.cpu(),
+            "staging_before": self.staged_before.cpu(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -242,6 +247,7 @@ class PhysicsPool:
         self.native = self._recorder.tensor.to(self.device)
         self.clock = self.native[:, self._layout.time].clone()
         self.staged = state["staging"].to(self.staged, copy=True)
+        self.staged_before = state.get("staging_before", self.staged).to(self.staged, copy=True)
 
     def keep_faults(self) -> None:
         """Write down what led to the present sicknesses, a file for each, where there is a folder for them."""

@@ -54,6 +54,8 @@ class Staging:
         self.columns = staging_columns(batches[0].sensordata.shape[1])
         self.width = max(batch.width for batch in batches) + 1
         """Of native rows: as many columns as the widest robot has, and one of zeros, which absent slots show."""
+        self.judged = max(batch.columns["ctrl"].start for batch in batches)
+        """So many columns of native rows are judged; targets, which come last, are kept for fault files alone."""
         shared = batches[0].columns
         self.time = shared["time"].start
         """Native column of the clock [s]."""
@@ -65,7 +67,7 @@ class Staging:
         counts = torch.tensor([sum(batch.num_envs for batch in batches) for batches in of_robots])
         firsts = [batches[0] for batches in of_robots]
         most = max(batch.spec.num_joints for batch in firsts)
-        judged = [limits(batch.columns, self.width) for batch in firsts]
+        judged = [limits(batch.columns, self.judged) for batch in firsts]
 
         def of_each(of: Callable[[RobotBatch], NDArray[Any]]) -> Tensor:
             return torch.from_numpy(np.stack([of(batch) for batch in firsts])).to(device)

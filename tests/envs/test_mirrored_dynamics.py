@@ -113,12 +113,11 @@ def put(env: HumanoidEnv, seed: int) -> Tensor:
         return torch.stack([x, mirrored(x, SLOTS)])
 
     env.reset()
-    staged = env.pool.reset(env._all, torch.stack([root, root * flips]), both(joint_pos), both(joint_vel))
+    env.pool.reset(env._all, torch.stack([root, root * flips]), both(joint_pos), both(joint_vel))
     command = normal(5, scale=0.4)
     env.commands.pin(torch.stack([command, mirrored(command, COMMAND)]))
     phase = torch.rand(1, generator=generator, dtype=torch.float64)
     env.phase = torch.cat([phase, (phase + 0.5) % 1.0])
-    env._last_joint_vel = staged[:, env.pool.columns["joint_vel"]]
     env._actions, env._last_actions = both(normal(NUM_SLOTS) * live), both(normal(NUM_SLOTS) * live)
     env._forget()
     return both(action)
