@@ -46,8 +46,13 @@ def _ignore(message: str) -> None:
 mujoco.set_mju_user_warning(_ignore)
 
 
-def limits(columns: Mapping[str, slice], width: int) -> tuple[Array, Array]:
+def limits(columns: Mapping[str, slice], width: int, finite: float) -> tuple[Array, Array]:
     """What a robot's native rows, see ``RobotBatch.columns``, are judged by, shape (``width``,) each.
+
+    Args:
+        columns: where everything lies in them.
+        width: so many columns are judged.
+        finite: the largest number there is in their precision.
 
     Returns:
         Largest magnitude of each number of a simulation that is well, and the code of being beyond it.
@@ -60,7 +65,7 @@ def limits(columns: Mapping[str, slice], width: int) -> tuple[Array, Array]:
     for alarm in ("status", "warning"):
         limit(columns[alarm], 0.0, "solver")
     qpos = columns["qpos"].start
-    limit(columns["qpos"], np.finfo(np.float64).max, "non_finite")
+    limit(columns["qpos"], finite, "non_finite")
     limit(slice(qpos, qpos + 3), (MAX_DISTANCE, MAX_DISTANCE, MAX_HEIGHT), "distance", "distance", "height")
     limit(columns["qvel"], MAX_SPEED, "velocity")
     return largest, beyond
@@ -91,9 +96,9 @@ class FlightRecorder:
 
     LENGTH = 8
 
-    def __init__(self, num_envs: int, width: int, pin_memory: bool = False) -> None:
+    def __init__(self, num_envs: int, width: int, dtype: torch.dtype, pin_memory: bool = False) -> None:
         """Start empty; memory from which a GPU reads is pinned."""
-        self._tensors = torch.zeros(self.LENGTH, num_envs, width, dtype=torch.float64, pin_memory=pin_memory)
+        self._tensors = torch.zeros(self.LENGTH, num_envs, width, dtype=dtype, pin_memory=pin_memory)
         self._rows: Array = self._tensors.numpy()
         self._age = np.zeros(num_envs, dtype=np.int64)
         self._latest = 0

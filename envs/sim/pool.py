@@ -56,7 +56,7 @@ class PhysicsPool:
             robots: what is simulated.
             decimation: physics steps per control step.
             device: the learner's.
-            dtype: of the staging rows.
+            dtype: of native and staging rows.
             num_threads: physics threads, 0 for one per core.
         """
         self.threads = Threads(num_threads or usable_cores(), "physics")
@@ -75,7 +75,7 @@ class PhysicsPool:
         self._layout = Staging(self.batches, dtype)
         self.conventions = self._layout.conventions(self._of_robots, device)
         self.columns = self._layout.columns
-        self._recorder = FlightRecorder(self.num_envs, self._layout.width, pin_memory=device.type == "cuda")
+        self._recorder = FlightRecorder(self.num_envs, self._layout.width, dtype, pin_memory=device.type == "cuda")
         self._readings = [
             [batch.readings(kept[rows]) for batch, rows in zip(self.batches, self.rows, strict=True)]
             for kept in self._recorder.all
@@ -83,16 +83,17 @@ class PhysicsPool:
         self._split: tuple[Tensor | None, list[tuple[int, Ids, Ids]]] = None, []
         self._read()
         self.native = self._recorder.tensor.to(device)
-        """What MuJoCo wrote in the last step, robot by robot, shape (N, columns of the widest)."""
+        """What MuJoCo wrote in the last step, robot by robot, shape (N, columns of the widest); not in double
+        precision, unless ``dtype`` is: no less is left of it than of what is staged, and it is half as much."""
         self.wild = torch.zeros(self.num_envs, dtype=torch.bool, device=device)
         """Whether the last action was absurd, shape (N,); see :meth:`aim`."""
         self.any_wild = self.wild.any()
-        self.clock = torch.zeros(self.num_envs, dtype=torch.float64, device=device)
+        self.clock = torch.zeros(self.num_envs, dtype=dtype, device=device)
         """Of each simulation after the last step [s], shape (N,)."""
         self.causes = torch.zeros(self.num_envs, dtype=torch.long, device=device)
         """What went wrong with each environment in the last step, 0 for nothing, shape (N,); see ``CAUSES``."""
         damping = [np.tile(batch.spec.to_slots(batch.spec.damping), (batch.num_envs, 1)) for batch in self.batches]
-        self.damping = torch.from_numpy(np.concatenate(damping)).to(device)
+        self.damping = torch.from_numpy(np.concatenate(damping)).to(device, dtype)
         """kd in force, in slots [N m s/rad], shape (N, 32)."""
         self.staged = torch.cat(self._blocks(self.native), dim=1)
         """Staging rows, see :func:`staging_columns`, shape (N, columns); a new tensor at each step. Rows of sick
@@ -132,8 +133,9 @@ class PhysicsPool:
             if forces is not None:
                 batch.apply_base_wrench(forces[rows])
             batch.step(native[rows, : batch.spec.num_joints], True if aimed is None else aimed[rows])
-            for written, values in after[part]:
-                written[:] = values
+            with np.errstate(over="ignore"):  # of who is sick
+                for written, values in after[part]:
+                    written[:] = values
 
         self.threads.share_out(advance, range(len(self.batches)))
         self.native = self._recorder.tensor.to(self.device, non_blocking=True)
@@ -224,7 +226,7 @@ class PhysicsPool:
             spec = self.batches[part].spec
             damping_ = spec.damping * kd[at][:, spec.slots]
             self.batches[part].set_gains(local, spec.stiffness * kp[at][:, spec.slots], damping_)
-            slots = torch.from_numpy(spec.to_slots(damping_)).to(self.device)
+            slots = torch.from_numpy(spec.to_slots(damping_)).to(self.damping)
             self.damping[ids[at[0] : at[-1] + 1]] = slots
 
     def state_dict(self) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from .health import limits
 
 @dataclass
 class Conventions:
-    """How each robot counts, measures and orders. Angles are in double precision, as the physics is."""
+    """How each robot counts, measures and orders. What is said of targets is in double precision, as physics is."""
 
     robot: Tensor
     """Of each environment, an index into what follows, int64, shape (N,)."""
@@ -49,7 +49,7 @@ class Staging:
     """Turns native rows, see ``RobotBatch.columns``, into staging rows."""
 
     def __init__(self, batches: Sequence[RobotBatch], dtype: torch.dtype) -> None:
-        """Take the columns of ``batches``; staging rows are of type ``dtype``."""
+        """Take the columns of ``batches``; native and staging rows are of type ``dtype``."""
         self._dtype = dtype
         self.columns = staging_columns(batches[0].sensordata.shape[1])
         self.width = max(batch.width for batch in batches) + 1
@@ -67,7 +67,7 @@ class Staging:
         counts = torch.tensor([sum(batch.num_envs for batch in batches) for batches in of_robots])
         firsts = [batches[0] for batches in of_robots]
         most = max(batch.spec.num_joints for batch in firsts)
-        judged = [limits(batch.columns, self.judged) for batch in firsts]
+        judged = [limits(batch.columns, self.judged, torch.finfo(self._dtype).max) for batch in firsts]
 
         def of_each(of: Callable[[RobotBatch], NDArray[Any]]) -> Tensor:
             return torch.from_numpy(np.stack([of(batch) for batch in firsts])).to(device)
@@ -78,13 +78,13 @@ class Staging:
         return Conventions(
             robot=torch.arange(len(counts)).repeat_interleave(counts).to(device),
             source=of_each(self._source),
-            signs=of_each(lambda batch: batch.spec.to_slots(batch.spec.signs)),
-            zero_offsets=of_each(lambda batch: batch.spec.to_slots(batch.spec.zero_offsets)),
+            signs=of_each(lambda batch: batch.spec.to_slots(batch.spec.signs)).to(self._dtype),
+            zero_offsets=of_each(lambda batch: batch.spec.to_slots(batch.spec.zero_offsets)).to(self._dtype),
             target_slots=of_each(lambda batch: padded(batch.spec.slots, "edge")),
             target_signs=of_each(lambda batch: padded(batch.spec.signs)),
             target_offsets=of_each(lambda batch: padded(batch.spec.zero_offsets)),
-            largest=torch.from_numpy(np.stack([largest for largest, _ in judged])).to(device),
-            beyond=torch.from_numpy(np.stack([beyond for _, beyond in judged])).to(device),
+            largest=torch.from_numpy(np.stack([largest for largest, _ in judged])).to(device, self._dtype),
+            beyond=torch.from_numpy(np.stack([beyond for _, beyond in judged])).to(device, self._dtype),
         )
 
     def blocks(self, native: Tensor, damping: Tensor, robot: Tensor, conventions: Conventions) -> list[Tensor]:
@@ -104,7 +104,7 @@ class Staging:
         canonical = (position - conventions.zero_offsets[robot], velocity, force - damping * velocity)
         in_slots = [conventions.signs[robot] * x for x in canonical]
         blocks = (native[:, self._root], moving, *in_slots, native[:, self._sensors])
-        return [block.to(self._dtype) for block in blocks]
+        return list(blocks)
 
     def _source(self, batch: RobotBatch) -> NDArray[np.int64]:
         """A row of ``Conventions.source``."""

@@ -119,7 +119,7 @@ def test_diagnosis_names_the_first_cause(
     row[:, columns["qpos"].start : columns["qpos"].start + 3] = torch.tensor(qpos, dtype=row.dtype)
     row[:, columns["qvel"].start + moving], row[:, columns["warning"]] = qvel, float(warned)
     row[:, columns["sensordata"]] = row[:, columns["ctrl"]] = 1e9  # which are nobody's concern
-    judged_by = (torch.from_numpy(x)[None] for x in limits(columns, width))
+    judged_by = (torch.from_numpy(x)[None] for x in limits(columns, width, np.finfo(np.float64).max))
     code = int(diagnose(row, *judged_by, torch.tensor([advanced]), torch.tensor([wild]))[0])
     if wild:
         expected = "action"
@@ -162,7 +162,7 @@ def test_the_last_states_are_kept(tmp_path: Path) -> None:
     (path,) = env.fault_folder.iterdir()
     fault = load_fault(path)
     assert (fault.robot, fault.cause, fault.env) == ("g1", "non_finite", 0)
-    assert np.array_equal(fault.qpos[:-1], seen[4:11]), "the seven states before"
+    assert np.array_equal(fault.qpos[:-1], np.float32(seen[4:11])), "the seven states before"
     assert np.isnan(fault.qpos[-1]).any(), "the sick state comes last"
     assert np.allclose(np.diff(fault.time), env.step_dt)
     assert fault.ctrl.shape == (FlightRecorder.LENGTH, robot("g1").num_joints)

@@ -74,7 +74,7 @@ def test_the_sick_are_numbered_among_their_robot_s_environments(tmp_path: Path) 
     (path,) = tmp_path.iterdir()
     fault = load_fault(path)
     assert (fault.robot, fault.cause, fault.env) == ("g1", CAUSES[0], SICK - PER_ROBOT)
-    assert np.array_equal(fault.qpos[-2], seen)
+    assert np.array_equal(fault.qpos[-2], np.float32(seen))
 
 
 def step_in_child(env: HumanoidEnv, expected: list[Any]) -> None:
