@@ -88,6 +88,7 @@ class PhysicsPool:
         self.wild = torch.zeros(self.num_envs, dtype=torch.bool, device=device)
         """Whether the last action was absurd, shape (N,); see :meth:`aim`."""
         self.any_wild = self.wild.any()
+        """Whether any was, bool, shape ()."""
         self.clock = torch.zeros(self.num_envs, dtype=dtype, device=device)
         """Of each simulation after the last step [s], shape (N,)."""
         self.causes = torch.zeros(self.num_envs, dtype=torch.long, device=device)
@@ -142,8 +143,9 @@ class PhysicsPool:
 
     def stage(self) -> None:
         """Judge what MuJoCo wrote in a step, and stage the rows of those who are well."""
-        time, robot, of = self.native[:, self._layout.time], self.conventions.robot, self.conventions
-        self.causes = diagnose(self.native[:, : self._layout.judged], of.largest[robot], of.beyond[robot], time > self.clock, self.wild)
+        judged, time = self.native[:, : self._layout.judged], self.native[:, self._layout.time]
+        robot, of = self.conventions.robot, self.conventions
+        self.causes = diagnose(judged, of.largest[robot], of.beyond[robot], time > self.clock, self.wild)
         self.clock = time.clone()
         blocks, sick = self._blocks(self.native), self.causes.unsqueeze(1) > 0
         before = self.staged.split([block.shape[1] for block in blocks], dim=1)
