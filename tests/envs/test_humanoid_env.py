@@ -111,6 +111,39 @@ def test_an_episode_starts_with_a_clean_slate() -> None:
     assert torch.equal(frames[1, 0], fresh.get_observations()["history"][1, :102]), "the default pose"
 
 
+def test_what_a_reset_or_a_new_command_changes_is_observed_as_if_all_were_observed_anew() -> None:
+    """A reset and a new command touch their own rows of the observations only, and must touch every column there."""
+    quick = replace(TaskCfg(), commands=CommandsCfg(resampling_time_s=0.1))
+    env, ends, draws = make_env(num_envs=5, task=quick), 0, 0
+    for step in range(14):
+        if step in (3, 8):
+            topple(env, step % 5)
+        before = env.commands.count.clone()
+        observations, _, dones, _ = env.step(actions(5, step))
+        env._forget()
+        whole = env.get_observations()
+        assert not env.state.joint_acc[dones].any(), "an episode begins without a past"
+        assert not env.state.last_foot_contact[dones].any()
+        ends, draws = ends + int(dones.sum()), draws + int((env.commands.count - before).sum())
+        for name, value in whole.items():
+            torch.testing.assert_close(observations[name], value, rtol=0.0, atol=1e-6, msg=f"{name}, step {step}")
+    assert ends >= 2
+    assert draws > ends, "no command was drawn in the middle of an episode"
+
+
+def test_what_was_handed_out_keeps_its_values() -> None:
+    env = make_env(num_envs=5)
+    env.step(actions(5, 0))
+    handed_out, state = env.get_observations(), env.state
+    copies = handed_out.clone(), state.root_pos_w.clone(), state.joint_vel.clone()
+    topple(env, 1)
+    env.step(actions(5, 1))
+    env.reset()
+    assert_same(handed_out, copies[0], "observations")
+    assert torch.equal(state.root_pos_w, copies[1])
+    assert torch.equal(state.joint_vel, copies[2])
+
+
 def test_time_outs_come_at_the_time_limit_only_and_carry_the_true_last_observations() -> None:
     """The last observation equals the one an environment with a longer limit gives at the same step."""
     limited, endless = make_env(task=SHORT), make_env()

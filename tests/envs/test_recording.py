@@ -90,6 +90,32 @@ def test_a_recording_returns_and_writes_what_its_method_does() -> None:
     assert len(add.graphs) == 2, "one kernel for each set of attributes that are not None"
 
 
+class Passing:
+    """A method that renames one attribute and does not use another."""
+
+    def __init__(self) -> None:
+        self.new, self.old, self.idle = torch.arange(3.0), torch.zeros(3), torch.ones(3)
+
+    def turn(self) -> tuple[Tensor]:
+        self.old, self.new = self.new, self.new + 1.0
+        return (self.old * 2.0,)
+
+
+@pytest.mark.usefixtures("uncompiled")
+def test_what_passes_through_is_not_copied_and_what_is_not_used_is_not_asked_for() -> None:
+    passing = Passing()
+    turn = Recording(passing, passing.turn, ("new", "old", "idle"), ("new", "old"))
+    for step in range(3):
+        before = passing.new
+        (doubled,) = turn()
+        assert passing.old is before
+        assert doubled.tolist() == [2.0 * (i + step) for i in range(3)]
+        assert passing.new.tolist() == [i + step + 1.0 for i in range(3)]
+    (graph,) = turn.graphs
+    assert sum(node.op == "placeholder" for node in graph.graph.nodes) == 1
+    assert len(graph(passing.new)) == 2, "the new value and what is returned"
+
+
 @pytest.mark.usefixtures("uncompiled")
 def test_recording_leaves_the_owner_as_it_was_and_results_share_no_memory() -> None:
     tally = Tally()

@@ -30,6 +30,8 @@ POOLING = "envs/pooling.py"
 STAGING = "envs/sim/staging.py"
 HEALTH = "envs/sim/health.py"
 PHYSICS_POOL = "envs/sim/pool.py"
+HUMANOID_ENV = "envs/humanoid_env.py"
+STEP_LOG = "envs/step_log.py"
 AIDS = "envs/mdp/aids.py"
 POSTURE = "envs/robots/posture.py"
 RESTING = "envs/mdp/posture.py"
@@ -131,6 +133,24 @@ MUTANTS: tuple[Mutant, ...] = (
     Mutant(HEALTH, "code.clamp(max=", "code.clamp(min=", "envs/test_health.py"),
     Mutant(PHYSICS_POOL, "self.causes.unsqueeze(1) > 0", "self.causes.unsqueeze(1) < 0", "envs/test_health.py"),
     Mutant(CONTROL_STEP, "in (dones, cut, due, sick)", "in (cut, dones, due, sick)", "envs/test_humanoid_env.py"),
+    Mutant(CONTROL_STEP, "self._step_count + 1", "self._step_count + 2", "envs/test_humanoid_env.py"),
+    Mutant(
+        PHYSICS_POOL,
+        "self.staged_before.index_copy(0, ids, rows)",
+        "self.staged_before.index_copy(0, ids, 0 * rows)",
+        "envs/test_humanoid_env.py",
+    ),
+    Mutant(
+        PHYSICS_POOL,
+        "self.staged_before = self.staged\n        self.staged = torch.cat",
+        "self.staged = torch.cat",
+        "envs/test_physics.py envs/test_humanoid_env.py",
+    ),
+    Mutant(HUMANOID_ENV, "group[ids] = rows", "group[ids] = group[ids]", "envs/test_humanoid_env.py"),
+    Mutant(HUMANOID_ENV, "self.pool.staged = self.pool.staged.clone()", "pass", "envs/test_humanoid_env.py"),
+    Mutant(HUMANOID_ENV, "penalty_interval_steps == 0:", "penalty_interval_steps == 1:", "envs/test_humanoid_env.py"),
+    Mutant(STEP_LOG, "x + block.to(x.dtype)", "block.to(x.dtype)", "envs/test_health.py"),
+    Mutant(RECORDING, "else given[source]", "else given[0]", "envs/test_recording.py"),
     Mutant(RECORDING, "else x[:count]", "else x[-count:]", "envs/test_recording.py"),
     Mutant(KERNELS, "(*node.args[:4], True,", "(*node.args[:4], False,", "test_kernels.py"),
     Mutant(KERNELS, "(product, negative)", "(negative, product)", "test_kernels.py"),
@@ -150,8 +170,8 @@ MUTANTS: tuple[Mutant, ...] = (
     ),
     Mutant(
         OBSERVATIONS,
-        "torch.cat((frame.unsqueeze(1), self.frames[:, :-1]), dim=1)",
-        "torch.cat((self.frames[:, 1:], frame.unsqueeze(1)), dim=1)",
+        "torch.cat((*columns, kept), dim=1)",
+        "torch.cat((kept, *columns), dim=1)",
         "mdp/test_observations.py",
     ),
     Mutant(EMBODIMENT, "scale * length.square()", "scale * length", "robots/test_embodiment.py"),
@@ -302,8 +322,8 @@ MUTANTS: tuple[Mutant, ...] = (
     Mutant(CONTROL_STEP, 'writes, *written), ("_state",)', "writes, *written), ()", "envs/test_recording.py"),
     Mutant(
         RECORDING,
-        "x.clone(memory_format=torch.contiguous_format) for x in results",
-        "x for x in results",
+        "x.clone(memory_format=torch.contiguous_format) for x, source",
+        "x for x, source",
         "envs/test_recording.py",
     ),
 )
