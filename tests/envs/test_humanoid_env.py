@@ -11,10 +11,19 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from eagle_rl.config.schema import CommandsCfg, ControlCfg, ObservationsCfg, RandomizationCfg, TaskCfg, TerminationsCfg
+from eagle_rl.config.schema import (
+    CommandsCfg,
+    ControlCfg,
+    ObservationsCfg,
+    RandomizationCfg,
+    RewardsCfg,
+    TaskCfg,
+    TerminationsCfg,
+)
 from eagle_rl.errors import ConfigError
 from envs.humanoid_env import HumanoidEnv
 from envs.mdp.observations import proprioception
+from envs.mdp.rewards import reward_factors
 from tests.envs.worlds import BARE, LOG_INTERVAL, actions, assert_same, make_env, rollout
 
 FALLEN = (0.7071067811865476, 0.7071067811865476, 0.0, 0.0)
@@ -131,6 +140,26 @@ def test_what_a_reset_or_a_new_command_changes_is_observed_as_if_all_were_observ
     assert draws > ends, "no command was drawn in the middle of an episode"
 
 
+def test_a_state_knows_the_joint_velocities_and_contacts_of_the_step_before() -> None:
+    env = make_env(num_envs=5)
+    for step in range(40):
+        before = env.state
+        dones = env.step(actions(5, step))[2]
+        moved = (env.state.joint_vel - before.joint_vel) / env.step_dt
+        torch.testing.assert_close(env.state.joint_acc[~dones], moved[~dones])
+        assert torch.equal(env.state.last_foot_contact[~dones], before.foot_contact[~dones])
+    assert before.foot_contact.any(), "nobody ever stood"
+
+
+def test_penalties_are_weighted_anew_when_their_curriculum_goes_on() -> None:
+    rewards = RewardsCfg(penalty_interval_steps=2)
+    env = make_env(task=replace(TaskCfg(), rewards=rewards))
+    for step in range(5):
+        env.step(actions(4, step))
+        expected = reward_factors(rewards.weights, 0.2 ** (0.8 ** ((step + 1) // 2)), env.step_dt, env.phase)
+        assert torch.equal(env._reward_factors, expected), step
+
+
 def test_what_was_handed_out_keeps_its_values() -> None:
     env = make_env(num_envs=5)
     env.step(actions(5, 0))
@@ -138,7 +167,10 @@ def test_what_was_handed_out_keeps_its_values() -> None:
     copies = handed_out.clone(), state.root_pos_w.clone(), state.joint_vel.clone()
     topple(env, 1)
     env.step(actions(5, 1))
+    later = env.state
+    root_pos = later.root_pos_w.clone()
     env.reset()
+    assert torch.equal(later.root_pos_w, root_pos)
     assert_same(handed_out, copies[0], "observations")
     assert torch.equal(state.root_pos_w, copies[1])
     assert torch.equal(state.joint_vel, copies[2])
