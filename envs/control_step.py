@@ -59,20 +59,7 @@ class Judgement(NamedTuple):
     flags: Tensor
     """Whether any of ``dones``, of ``cut``, of the commands whose time is up, of the sick, bool, shape (4,)."""
     command: Tensor
-    clock: Tensor
-    critic: Tensor
-    estimate: Tensor
-
-    @property
-    def groups(self) -> DerivedGroups:
-        """Observations of the state the step led to."""
-        return DerivedGroups(self.command, self.clock, self.critic, self.estimate)
-
-
-class DerivedGroups(NamedTuple):
-    """Observation groups that are worked out from the state, float32, see ``ObservationLayout``."""
-
-    command: Tensor
+    """What follows are the fields of ``DerivedGroups``."""
     clock: Tensor
     critic: Tensor
     estimate: Tensor
@@ -91,10 +78,19 @@ class Sight(NamedTuple):
     critic: Tensor
     estimate: Tensor
 
-    @property
-    def groups(self) -> DerivedGroups:
-        """The observation groups."""
-        return DerivedGroups(self.command, self.clock, self.critic, self.estimate)
+
+class DerivedGroups(NamedTuple):
+    """Observation groups that are worked out from the state, float32, see ``ObservationLayout``."""
+
+    command: Tensor
+    clock: Tensor
+    critic: Tensor
+    estimate: Tensor
+
+    @classmethod
+    def of(cls, seen: Judgement | Sight) -> DerivedGroups:
+        """Those that were worked out with other things."""
+        return cls(seen.command, seen.clock, seen.critic, seen.estimate)
 
 
 class Episode(NamedTuple):

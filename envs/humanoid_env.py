@@ -17,7 +17,7 @@ from torch import Tensor
 from eagle_rl.config.schema import TaskCfg
 from eagle_rl.errors import CompileError, EagleWarning
 
-from .control_step import ControlStep, Sight, compile_step
+from .control_step import ControlStep, DerivedGroups, Sight, compile_step
 from .ground import make_ground
 from .mdp.active_commands import ActiveCommands
 from .mdp.aids import LearningAids, harness_damping
@@ -172,7 +172,7 @@ class HumanoidEnv(ControlStep, VecEnv):
             self._weigh()
         self._forget()
         judged = self._judge()
-        dones, time_outs, self._groups = judged.dones, judged.time_outs, judged.groups
+        dones, time_outs, self._groups = judged.dones, judged.time_outs, DerivedGroups.of(judged)
         any_done, any_cut, any_due, any_sick = judged.flags.tolist()
         if any_sick:
             self.pool.keep_faults()
@@ -288,7 +288,7 @@ class HumanoidEnv(ControlStep, VecEnv):
         """Observe some environments anew, shape (n,); the others are observed as they were."""
         self._state = None
         seen = self._look(ids)
-        for group, rows in zip(self._groups or (), seen.groups, strict=False):
+        for group, rows in zip(self._groups or (), DerivedGroups.of(seen), strict=False):
             group[ids] = rows
         return seen
 
