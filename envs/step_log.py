@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -119,15 +118,13 @@ class StepLog:
         entry = dict(zip(_tags(self._columns, self._names), table.flatten().tolist(), strict=True))
         return entry, falls_per_step.squeeze(1), match.squeeze(1)
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> dict[str, Tensor]:
         """The sums of the unfinished interval."""
         return {"sums": self.sums.clone()}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` returned; sums by robot, which used to be kept, are dropped."""
-        sums: Tensor | None = state["sums"]
-        known = sums is not None and sums.shape == self.sums.shape
-        self.sums = sums.to(self.sums, copy=True) if known and sums is not None else torch.zeros_like(self.sums)
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Restore what :meth:`state_dict` returned."""
+        self.sums = state["sums"].to(self.sums, copy=True)
 
 
 @lru_cache(maxsize=8)

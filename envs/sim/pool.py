@@ -251,7 +251,7 @@ class PhysicsPool:
         self.native = self._recorder.tensor.to(self.device)
         self.clock = self.native[:, self._layout.time].clone()
         self.staged = state["staging"].to(self.staged, copy=True)
-        self.staged_before = state.get("staging_before", self.staged).to(self.staged, copy=True)
+        self.staged_before = state["staging_before"].to(self.staged, copy=True)
 
     def keep_faults(self) -> None:
         """Write down what led to the present sicknesses, a file for each, where there is a folder for them."""

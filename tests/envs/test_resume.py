@@ -107,20 +107,6 @@ def test_resumes_without_randomization_and_in_double_precision() -> None:
     assert_continues(lambda: make_env(task=BARE, dtype=torch.float64), 30, LOG_INTERVAL)
 
 
-def test_a_state_that_was_saved_by_an_earlier_version_goes_on() -> None:
-    """Logs were summed by robot, and of the step before joint velocities and contacts were kept instead of all."""
-    straight, resumed = make_env(task=BUSY), make_env(task=BUSY)
-    run(straight, range(LOG_INTERVAL))
-    state = straight.state_dict()
-    del state["pool"]["staging_before"]
-    state["buffers"]["_last_joint_vel"] = torch.zeros(straight.num_envs, 32)
-    for sums in (None, torch.zeros(2, 39)):
-        resumed.load_state_dict(state | {"step_log": {"sums": sums, "steps": 0, "columns": []}})
-        assert_same(straight.get_observations(), resumed.get_observations(), "directly after loading")
-    log = run(resumed, range(LOG_INTERVAL, 2 * LOG_INTERVAL))[-1][3]["log"]
-    assert log.keys() == run(straight, range(LOG_INTERVAL, 2 * LOG_INTERVAL))[-1][3]["log"].keys()
-
-
 def digest() -> str:
     """Of everything a few busy steps return."""
     sha = hashlib.sha256()
