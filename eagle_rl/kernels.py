@@ -48,7 +48,7 @@ def record(function: Callable[..., list[Tensor]], inputs: Sequence[Tensor]) -> f
 
 
 def drop_unused(graph: fx.GraphModule) -> list[int]:
-    """Take from a graph the inputs that it does not use; which those are that are left."""
+    """Take from a graph the inputs that it does not use; returns the indices of the others."""
     places = [node for node in graph.graph.nodes if node.op == "placeholder"]
     used = [i for i, place in enumerate(places) if place.users]
     for place in places:

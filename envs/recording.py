@@ -116,7 +116,7 @@ class InBlocks:
     """Stands in for a method of any number of rows: its recording for so many, as often as it takes."""
 
     MOST = 8
-    """Blocks; of more rows at once the method itself is the quicker."""
+    """Blocks; with twice as many the method itself is as quick (``docs/performance.md``)."""
 
     def __init__(self, recording: Recording, method: Callable[[Tensor], Any], size: int) -> None:
         """Use ``recording`` of ``method`` for ``size`` rows, whose results are tuples of tensors."""

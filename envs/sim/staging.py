@@ -103,8 +103,7 @@ class Staging:
         position, velocity, force = joints
         canonical = (position - conventions.zero_offsets[robot], velocity, force - damping * velocity)
         in_slots = [conventions.signs[robot] * x for x in canonical]
-        blocks = (native[:, self._root], moving, *in_slots, native[:, self._sensors])
-        return list(blocks)
+        return [native[:, self._root], moving, *in_slots, native[:, self._sensors]]
 
     def _source(self, batch: RobotBatch) -> NDArray[np.int64]:
         """A row of ``Conventions.source``."""
