@@ -196,13 +196,6 @@ class PhysicsPool:
         self.staged_before = self.staged_before.index_copy(0, ids, rows)
         self.clock[ids] = 0.0
 
-    def reset(self, ids: Tensor, root: Tensor, joint_pos: Tensor, joint_vel: Tensor) -> Tensor:
-        """:meth:`place` and :meth:`restage`; returns the new staging rows."""
-        self.place(ids, root, joint_pos, joint_vel)
-        self.staged, rows = self.staged.clone(), self.staging_rows(ids)
-        self.restage(ids, rows)
-        return rows
-
     def push(self, ids: Tensor, lin_vel_w: Tensor, ang_vel_b: Tensor) -> None:
         """Add velocity to the bases of some environments before the next step, shape (n, 3) each."""
         linear, angular = (x.to("cpu", torch.float64).numpy() for x in (lin_vel_w, ang_vel_b))

@@ -113,7 +113,8 @@ def put(env: HumanoidEnv, seed: int) -> Tensor:
         return torch.stack([x, mirrored(x, SLOTS)])
 
     env.reset()
-    env.pool.reset(env._all, torch.stack([root, root * flips]), both(joint_pos), both(joint_vel))
+    env.pool.place(env._all, torch.stack([root, root * flips]), both(joint_pos), both(joint_vel))
+    env.pool.restage(env._all, env.pool.staging_rows(env._all))
     command = normal(5, scale=0.4)
     env.commands.pin(torch.stack([command, mirrored(command, COMMAND)]))
     phase = torch.rand(1, generator=generator, dtype=torch.float64)
