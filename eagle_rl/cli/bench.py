@@ -30,7 +30,7 @@ PARTS: dict[str, str] = {
     "resources": "memory and start-up of 4096 environments, --help, first iteration",
     "profile": "where the time of an iteration goes",
     "processes": "one process against a process a core, in whole runs",
-    "quality": "time and steps until ppo on G1 alone is good, hours; resumed with the same --run",
+    "quality": "time and steps until ppo is good, on G1 alone or as key=value says; resumed with the same --run",
 }
 DEFAULT = ("environment", "pooling", "scaling", "iteration", "resources")
 
@@ -40,9 +40,12 @@ def _parser() -> argparse.ArgumentParser:
         prog="eagle bench",
         description="Measure speed and memory. Both sides of a ratio are measured in turns in one process, so that "
         "other work on the machine slows both; still, leave it alone for numbers worth keeping.",
+        usage="eagle bench [PART ...] [options]\n       eagle bench quality [key=value ...] [options]",
         epilog="Parts: " + "; ".join(f"{name}: {what}" for name, what in PARTS.items()) + ".",
     )
-    parser.add_argument("parts", nargs="*", metavar="PART", help=f"what to measure [{' '.join(DEFAULT)}]")
+    parser.add_argument(
+        "words", nargs="*", metavar="PART key=value", help=f"what to measure [{' '.join(DEFAULT)}]; settings of quality"
+    )
     parser.add_argument("--envs", type=count, default=512, metavar="N", help="environments over all robots [512]")
     parser.add_argument("--threads", type=count, metavar="N", help="physics threads [one a core]")
     parser.add_argument("--seconds", type=duration, default=10.0, metavar="S", help="time for each ratio [10]")
@@ -52,6 +55,18 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures into FILE too")
     return parser
+
+
+def _told_apart(words: Sequence[str]) -> tuple[Sequence[str], list[str]]:
+    """Parts, the default ones if none is named, and settings of ``quality``."""
+    settings = [word for word in words if "=" in word]
+    parts = [word for word in words if word not in settings] or DEFAULT
+    for part in parts:
+        if part not in PARTS:
+            raise EagleError(f"eagle bench: no part {part!r}.{did_you_mean(part, PARTS)} Known: {', '.join(PARTS)}.")
+    if settings and "quality" not in parts:
+        raise EagleError(f"eagle bench: {settings[0]} is a setting of the part quality, which is not asked for.")
+    return parts, settings
 
 
 def _import_benchmarks() -> None:
@@ -66,7 +81,7 @@ def _import_benchmarks() -> None:
         sys.path.insert(0, str(root))
 
 
-def _measure(part: str, args: argparse.Namespace, threads: int) -> list[Figure]:
+def _measure(part: str, args: argparse.Namespace, settings: list[str], threads: int) -> list[Figure]:
     from benchmarks import resources, throughput
     from benchmarks.processes import processes
     from benchmarks.profile import profile
@@ -86,7 +101,7 @@ def _measure(part: str, args: argparse.Namespace, threads: int) -> list[Figure]:
         "resources": lambda: resources.large() + resources.answers() + resources.first_iteration(),
         "profile": lambda: profile(envs, threads),
         "processes": lambda: processes(envs, threads),
-        "quality": lambda: time_to_quality(quality_experiment(envs, threads), args.run, args.minutes),
+        "quality": lambda: time_to_quality(quality_experiment(envs, threads, settings), args.run, args.minutes),
     }
     return measurements[part]()
 
@@ -118,18 +133,15 @@ def _shown(figure: Figure) -> str:
 
 def main(argv: Sequence[str]) -> int:
     """Run ``eagle bench``."""
-    args = _parser().parse_args(argv)
-    parts = args.parts or DEFAULT
-    for part in parts:
-        if part not in PARTS:
-            raise EagleError(f"eagle bench: no part {part!r}.{did_you_mean(part, PARTS)} Known: {', '.join(PARTS)}.")
+    args = _parser().parse_intermixed_args(argv)
+    parts, settings = _told_apart(args.words)
     threads = args.threads or usable_cores()
     _import_benchmarks()
     machine = describe_machine(args.envs, threads)
     figures: list[Figure] = []
     for part in parts:
         print(f"measuring: {PARTS[part]}", file=sys.stderr)
-        figures += _measure(part, args, threads)
+        figures += _measure(part, args, settings, threads)
     print(table(machine, figures))
     if args.json is not None:
         args.json.write_text(json.dumps({"machine": machine, "figures": [asdict(f) for f in figures]}, indent=1))

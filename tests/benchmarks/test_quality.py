@@ -11,6 +11,7 @@ from benchmarks import quality
 from benchmarks.quality import Check, quality_experiment, time_to_quality
 from eagle_rl.config.schema import ExperimentCfg
 from eagle_rl.errors import CheckpointError
+from eagle_rl.evaluation.metrics import RobotMetrics, TrackingErrors
 
 
 @pytest.fixture
@@ -29,7 +30,7 @@ def test_a_run_that_ran_out_of_time_goes_on_where_it_was(cfg, tmp_path, monkeypa
     monkeypatch.setattr(quality, "MAX_ERROR_VX", 0.0)  # never good
     steps = []
     for _ in range(4):
-        million, seconds = time_to_quality(cfg, tmp_path, minutes=0.0, iterations=1)
+        million, seconds = time_to_quality(cfg, tmp_path, minutes=0.0, env_steps_per_robot=1)
         steps.append(round(1e6 * million.value))
         assert "NOT YET" in seconds.detail
     assert steps == [32, 64, 96, 96], "one check at a time, and none beyond the budget"
@@ -38,15 +39,34 @@ def test_a_run_that_ran_out_of_time_goes_on_where_it_was(cfg, tmp_path, monkeypa
     assert checks[0]["seconds"] < checks[1]["seconds"] < checks[2]["seconds"]
 
 
+def test_looks_are_as_far_apart_whatever_the_batch_and_the_fleet(cfg, tmp_path, monkeypatch):
+    monkeypatch.setattr(quality, "MAX_ERROR_VX", 0.0)  # never good
+    fleet = replace(cfg, robots=("g1", "h1"))
+    looks = [time_to_quality(c, tmp_path / c.robots[-1], minutes=0.0, env_steps_per_robot=40) for c in (cfg, fleet)]
+    assert [round(1e6 * million.value) for million, _ in looks] == [64, 96], "two and three iterations of 32 steps"
+
+
+def test_a_fleet_is_as_good_as_its_worst_robot(cfg, tmp_path, monkeypatch):
+    def robot(survival, error):
+        tracking = TrackingErrors(share=1.0, errors=(error,) * 5, charged=(error,) * 5)
+        return RobotMetrics(num_envs=2, survival=survival, upright=survival, subsets={"all": tracking})
+
+    fleet = {"g1": robot(0.96, 0.1), "h1": robot(0.9, 0.3), "t1": robot(0.0, None)}
+    for judged, told in ((("g1", "h1"), "survival 90.0%, E_vx 0.300"), (fleet, "survival 0.0%, E_vx 0.300")):
+        monkeypatch.setattr(quality, "evaluate", lambda *_, judged=judged: {name: fleet[name] for name in judged})
+        _, seconds = time_to_quality(cfg, tmp_path / f"{len(judged)}", minutes=0.0, env_steps_per_robot=1)
+        assert told in seconds.detail
+
+
 def test_a_good_policy_is_not_trained_further(cfg, tmp_path, monkeypatch):
     monkeypatch.setattr(quality, "MIN_SURVIVAL", 0.0)
     monkeypatch.setattr(quality, "MAX_ERROR_VX", 100.0)
     for _ in range(2):
-        million, _ = time_to_quality(cfg, tmp_path, minutes=1.0, iterations=1)
+        million, _ = time_to_quality(cfg, tmp_path, minutes=1.0, env_steps_per_robot=1)
         assert round(1e6 * million.value) == 32
 
 
 def test_another_experiment_does_not_go_on_with_the_run(cfg, tmp_path):
-    time_to_quality(cfg, tmp_path, minutes=0.0, iterations=1)
+    time_to_quality(cfg, tmp_path, minutes=0.0, env_steps_per_robot=1)
     with pytest.raises(CheckpointError, match="seed"):
-        time_to_quality(replace(cfg, seed=2), tmp_path, minutes=0.0, iterations=1)
+        time_to_quality(replace(cfg, seed=2), tmp_path, minutes=0.0, env_steps_per_robot=1)

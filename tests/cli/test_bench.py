@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from benchmarks import throughput
+from benchmarks import quality, throughput
 from benchmarks.measure import Figure
 from eagle_rl.cli import bench
 from eagle_rl.errors import EagleError
@@ -14,6 +14,16 @@ def test_an_unknown_part_is_refused_before_anything_is_measured(monkeypatch):
     monkeypatch.setattr(bench, "_measure", lambda *args: pytest.fail("measured"))
     with pytest.raises(EagleError, match="Did you mean scaling"):
         bench.main(["environment", "scalling"])
+
+
+def test_settings_go_to_quality_and_nowhere_else(monkeypatch, tmp_path):
+    asked = []
+    monkeypatch.setattr(quality, "time_to_quality", lambda cfg, folder, minutes: asked.append(cfg) or [])
+    words = ["robots=[t1,n1]", "--envs", "16", "algo.num_steps_per_env=48", "--run", str(tmp_path)]
+    with pytest.raises(EagleError, match=r"robots=\[t1,n1\] is a setting of the part quality"):
+        bench.main(["scaling", *words])
+    bench.main(["quality", *words])
+    assert [(cfg.robots, cfg.num_envs, cfg.algo.num_steps_per_env) for cfg in asked] == [(("t1", "n1"), 16, 48)]
 
 
 def test_figures_come_as_a_table_and_as_json_with_the_machine(monkeypatch, capsys, tmp_path):
