@@ -33,6 +33,8 @@ PARTS: dict[str, str] = {
     "quality": "time and steps until ppo is good, on G1 alone or as key=value says; resumed with the same --run",
 }
 DEFAULT = ("environment", "pooling", "scaling", "iteration", "resources")
+OPTIONS = {"num_envs": "--envs", "run.num_threads": "--threads"}
+"""Options that say what these settings would: the table names what an option says."""
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -66,6 +68,9 @@ def _told_apart(words: Sequence[str]) -> tuple[Sequence[str], list[str]]:
             raise EagleError(f"eagle bench: no part {part!r}.{did_you_mean(part, PARTS)} Known: {', '.join(PARTS)}.")
     if settings and "quality" not in parts:
         raise EagleError(f"eagle bench: {settings[0]} is a setting of the part quality, which is not asked for.")
+    for key, _, value in (setting.partition("=") for setting in settings):
+        if key in OPTIONS:
+            raise EagleError(f"eagle bench: {key}={value} has an option of its own. Write {OPTIONS[key]} {value}.")
     return parts, settings
 
 

@@ -26,6 +26,13 @@ def test_settings_go_to_quality_and_nowhere_else(monkeypatch, tmp_path):
     assert [(cfg.robots, cfg.num_envs, cfg.algo.num_steps_per_env) for cfg in asked] == [(("t1", "n1"), 16, 48)]
 
 
+@pytest.mark.parametrize(("setting", "option"), [("num_envs=128", "--envs 128"), ("run.num_threads=1", "--threads 1")])
+def test_a_setting_that_an_option_says_is_refused_with_the_option(monkeypatch, setting, option):
+    monkeypatch.setattr(bench, "_measure", lambda *args: pytest.fail("measured"))
+    with pytest.raises(EagleError, match=f"{setting}.*Write {option}"):
+        bench.main(["quality", setting])
+
+
 def test_figures_come_as_a_table_and_as_json_with_the_machine(monkeypatch, capsys, tmp_path):
     figures = [Figure("speed", 0.8125, "x", ">= 0.9", "a 1 ms"), Figure("part", 0.25, "share", "", "")]
     monkeypatch.setattr(throughput, "scaling", lambda envs, seconds: figures if (envs, seconds) == (64, 2.0) else [])
