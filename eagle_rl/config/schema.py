@@ -149,6 +149,9 @@ class PlanCfg:
     root: str | None = None
     """Checkpoint to fork from instead of training a generalist; with method ``ppo`` the generalist's budget is then
     spent on continuing from it."""
+    teachers: tuple[str, ...] = ()
+    """Who teaches each robot in the first round, in the order of ``robots``: ``specialist``, one of the round's own,
+    ``generalist``, the policy the round starts from, or the file of a specialist; without any, specialists (ours)."""
     search_env_steps: int = 0
     """Budget of the search that follows each specialist's training; 0 for none (ours)."""
     correction_env_steps: int = 0
@@ -194,7 +197,7 @@ class CorrectionCfg:
     num_envs: int = 768
     """Robots in a rollout; a probe takes three rollouts [-]."""
     num_steps: int = 220
-    """Control steps of a rollout, from rest."""
+    """Control steps of a rollout, from rest; robots in trials then follow another command for as many."""
     upright_share: float = 0.25
     """Of the robots, whose height and pitch commands are zero [-]; see ``task.commands.upright_probability``."""
     settling_steps: int = 60

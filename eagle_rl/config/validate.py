@@ -222,11 +222,13 @@ def _plan_faults(cfg: ExperimentCfg) -> Iterator[Fault]:
     if cfg.num_envs < len(cfg.robots):
         yield "num_envs", f"{cfg.num_envs} is less than one environment for each of {len(cfg.robots)} robots"
     plan = cfg.plan
+    yield from _teacher_faults(cfg)
+    own = "specialist" in plan.teachers or not plan.teachers or plan.max_rounds > 1
     if plan.method != "ppo":
         others = 0 if plan.method == "compass" else plan.search_env_steps + plan.correction_env_steps
         specialists = plan.specialist_env_steps + others
         budgets = {"specialist_env_steps": specialists, "distill_env_steps": plan.distill_env_steps}
-        for key in (key for key, budget in budgets.items() if budget == 0):
+        for key in (key for key, budget in budgets.items() if budget == 0 and (own or key != "specialist_env_steps")):
             yield f"plan.{key}", f"0, but method {plan.method} needs a budget for this stage"
     for name, rollout in (("search", cfg.search), ("correction", cfg.correction)):
         steps, settling = rollout.num_steps, rollout.settling_steps
@@ -237,6 +239,14 @@ def _plan_faults(cfg: ExperimentCfg) -> Iterator[Fault]:
             yield f"run.{key}", f"got {getattr(cfg.run, key)!r}, expected cpu, cuda or cuda:N"
     if not re.fullmatch(r"\w[\w.-]*", cfg.name):
         yield "name", f"got {cfg.name!r}, expected letters, digits, - and _: it names the run's folder"
+
+
+def _teacher_faults(cfg: ExperimentCfg) -> Iterator[Fault]:
+    teachers, method = cfg.plan.teachers, cfg.plan.method
+    if teachers and len(teachers) != len(cfg.robots):
+        yield "plan.teachers", f"{len(teachers)} named, expected one for each of {len(cfg.robots)} robots"
+    if teachers and method not in ("eagle", "kickstarting"):
+        yield "plan.teachers", f"named, but method {method} distils no specialists; expected eagle or kickstarting"
 
 
 def _correction_faults(cfg: ExperimentCfg) -> Iterator[Fault]:

@@ -163,9 +163,15 @@ class CorrectionRunner:
         return candidates[best]
 
     def _costs(self, corrections: list[Correction], number: int) -> list[Tensor]:
-        """Commands (2 M, 5), and what each correction costs there (2 M,): calm robots, then rough ones."""
+        """Commands (4 M, 5), and what each correction costs there (4 M,): calm robots, then rough ones.
+
+        They are given another command half-way, at which a robot may fall that stood under each from rest
+        (docs/experiments.md, 35).
+        """
         worlds = ((number, self._robots.calm), (number + 1, self._robots.rough))
-        rollouts = [[self._robots.follow(each, seed, ev=ev) for seed, ev in worlds] for each in corrections]
+        rollouts = [
+            [self._robots.follow(each, seed, ev=ev, num_commands=2) for seed, ev in worlds] for each in corrections
+        ]
         return [torch.cat([r.command for r in rollouts[0]]), *(torch.cat([r.cost for r in both]) for both in rollouts)]
 
     def _probe(self, correction: Correction, number: int) -> Probe:

@@ -1,9 +1,9 @@
-"""Robots of one kind that follow commands from rest by a corrected policy: what it costs, and what they saw."""
+"""Robots of one kind that follow commands by a corrected policy: what it costs, and what they saw."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import torch
@@ -21,7 +21,7 @@ from eagle_rl.models.correction import Correction
 
 @dataclass(frozen=True)
 class Rollout:
-    """What came of M robots."""
+    """What came of M robots, those that follow another command after theirs counted once more for it."""
 
     command: Tensor
     """As the policy saw it, shape (M, 5)."""
@@ -80,20 +80,27 @@ class Followers:
         change: Tensor | float = 0.0,
         gains: Tensor | float = 0.0,
         ev: EvaluationCfg | None = None,
+        num_commands: int = 1,
     ) -> Rollout:
-        """Let robots follow the commands of this number, in calm or by ``ev``, with something changed."""
+        """Let robots follow commands of this number from rest, in calm or by ``ev``, with something changed.
+
+        Of ``num_commands`` one after the other, each is a rollout of its own.
+        """
         ev = ev or self.calm
-        settling = self.cfg.correction.settling_steps
-        errors, phases, falls = [], [], []
-        for step in self._walk(number, ev, lambda obs: correction.act(self._actor, obs, change, gains)):
-            errors.append(step.error)
-            phases.append(step.phase)
-            falls.append(step.fell)
-        command = step.before["command"]
-        late, fell = torch.stack(errors[settling:]), torch.stack(falls).any(dim=0)
+        walk = self._walk(number, ev, lambda obs: correction.act(self._actor, obs, change, gains), num_commands)
+        steps = [replace(step, before=step.before.select("command")) for step in walk]  # histories would fill memory
+        each = self.cfg.correction.num_steps
+        rollouts = [self._rollout(steps[start : start + each]) for start in range(0, len(steps), each)]
+        return Rollout(*(torch.cat([getattr(r, field.name) for r in rollouts]) for field in fields(Rollout)))
+
+    def _rollout(self, steps: list[_Step]) -> Rollout:
+        """What came of robots that followed one command."""
+        late, fell = steps[self.cfg.correction.settling_steps :], torch.stack([step.fell for step in steps]).any(dim=0)
+        errors = torch.stack([step.error for step in late])
         worst = (self.limits.abs().amax(dim=1) / self._units).mean()
-        cost = torch.where(fell, worst, late.abs().mean(dim=(0, 2)))
-        return Rollout(command, error_waves(late, torch.stack(phases[settling:])), cost, fell)
+        cost = torch.where(fell, worst, errors.abs().mean(dim=(0, 2)))
+        waves = error_waves(errors, torch.stack([step.phase for step in late]))
+        return Rollout(command=steps[0].before["command"], waves=waves, cost=cost, fell=fell)
 
     def disturbed(self, correction: Correction, number: int, ev: EvaluationCfg) -> Trace:
         """What robots saw and did with noise of ``correction.foresight_std`` on every action, if they stayed up."""
@@ -117,23 +124,37 @@ class Followers:
         )
         return trace.of(stood)
 
-    def _walk(self, number: int, ev: EvaluationCfg, act: Callable[[TensorDict], Tensor]) -> Iterator[_Step]:
-        """Step robots from rest."""
-        correcting = self.cfg.correction
-        ev = replace(ev, seed=self._seed + number)
-        drawn = draw_commands(self.cfg.task.commands, ev, self.cfg.robots[0], correcting.num_envs)
-        commands = drawn[:, 0].to(self._units)
-        commands[: round(correcting.upright_share * len(commands)), NUM_VELOCITIES:] = 0.0
-        env = self.env(correcting.num_envs, ev)
-        env.pin_commands(commands)
-        obs = env.get_observations()
-        for _ in range(correcting.num_steps):
-            before = obs
-            obs, _, dones, extras = env.step(act(before))
-            self.env_steps += len(commands)
-            yield _Step(
-                before=before.select("history", "phase", "command"),
-                phase=obs["phase"],
-                error=(env.measured_commands().to(commands) - commands) / self._units,
-                fell=dones.bool() & ~extras["time_outs"].bool(),
-            )
+    def _walk(
+        self, number: int, ev: EvaluationCfg, act: Callable[[TensorDict], Tensor], num_commands: int = 1
+    ) -> Iterator[_Step]:
+        """Step robots from rest, ``correction.num_steps`` for every command."""
+        env = self.env(self.cfg.correction.num_envs, ev)
+        for commands in self._commands(number, num_commands).unbind(dim=1):
+            env.pin_commands(commands)
+            obs = env.get_observations()
+            for _ in range(self.cfg.correction.num_steps):
+                before = obs
+                obs, _, dones, extras = env.step(act(before))
+                self.env_steps += len(commands)
+                yield _Step(
+                    before=before.select("history", "phase", "command"),
+                    phase=obs["phase"],
+                    error=(env.measured_commands().to(commands) - commands) / self._units,
+                    fell=dones.bool() & ~extras["time_outs"].bool(),
+                )
+
+    def _commands(self, number: int, num_commands: int) -> Tensor:
+        """Commands of this number, some of them upright, shape (M, num_commands, 5)."""
+        correcting, ev = self.cfg.correction, self.calm
+        ev = replace(
+            ev,
+            seed=self._seed + number,
+            num_steps=num_commands * ev.num_steps,
+            resampling_time_s=ev.num_steps * ev.physics_dt * ev.decimation,
+        )
+        commands = draw_commands(self.cfg.task.commands, ev, self.cfg.robots[0], correcting.num_envs).to(self._units)
+        upright = round(correcting.upright_share * len(commands))
+        for draw in range(num_commands):  # half of who was upright stays so
+            rows = (torch.arange(upright) + draw * upright // 2) % len(commands)
+            commands[rows, draw, NUM_VELOCITIES:] = 0.0
+        return commands

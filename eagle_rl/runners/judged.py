@@ -15,6 +15,7 @@ _POLICIES = {
     "residual": "specialist",
     "search": "searched specialist",
     "correct": "corrected specialist",
+    "teacher": "given specialist",
     "base": "base",
     "average": "averaged",
 }

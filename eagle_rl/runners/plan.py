@@ -1,7 +1,8 @@
 """Algorithm 1 of the paper as data: which stages an experiment consists of, what each starts from and what it costs.
 
 Line 1 of the algorithm is the stage ``generalist`` (or ``root``, when the experiment forks from a checkpoint); lines
-3-4 are ``roundR/specialist_ROBOT`` and, ours, ``roundR/search_ROBOT`` and ``roundR/correct_ROBOT``; lines 5-9 are
+3-4 are ``roundR/specialist_ROBOT`` and, ours, ``roundR/search_ROBOT`` and ``roundR/correct_ROBOT``, or
+``round1/teacher_ROBOT`` where there is a specialist already; lines 5-9 are
 ``roundR/distill`` and, ours, ``roundR/average``. Nothing here imports torch.
 """
 
@@ -15,12 +16,25 @@ from typing import Literal
 from eagle_rl.config.schema import ExperimentCfg, TaskCfg
 
 Kind = Literal[
-    "root", "generalist", "continued", "specialist", "search", "correct", "distill", "average", "base", "residual"
+    "root",
+    "generalist",
+    "continued",
+    "specialist",
+    "search",
+    "correct",
+    "teacher",
+    "distill",
+    "average",
+    "base",
+    "residual",
 ]
 Imitation = Literal["eagle", "kickstart"]
 
-ALONE: tuple[Kind, ...] = ("specialist", "search", "correct", "residual")
-"""What improves one robot."""
+TEACHERS = ("specialist", "generalist")
+"""What ``plan.teachers`` may name beside files."""
+
+ALONE: tuple[Kind, ...] = ("specialist", "search", "correct", "teacher", "residual")
+"""What is for one robot."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,8 +52,10 @@ class Stage:
     """The budget in whole learning iterations, generations of a search or probes of a correction, rounded up."""
     init: str | None = None
     """Stage whose final weights this one starts from."""
+    source: str | None = None
+    """File of the specialist that a ``teacher`` is."""
     teachers: tuple[str, ...] = ()
-    """The stage that ended each robot's specialist, in the order of ``robots``."""
+    """The stage whose policy teaches each robot, in the order of ``robots``."""
     imitation: Imitation | None = None
     start: str | None = None
     """Stage whose weights those of ``init`` are averaged with."""
@@ -66,12 +82,12 @@ class Stage:
     @property
     def position(self) -> float:
         """Where its policy stands among the rounds: specialists before the generalist they teach, an average after."""
-        before = {"specialist": 0.5, "residual": 0.5, "search": 0.25, "correct": 0.15, "average": -0.2}
+        before = {"specialist": 0.5, "residual": 0.5, "teacher": 0.5, "search": 0.25, "correct": 0.15, "average": -0.2}
         return self.round - before.get(self.kind, 0.0)
 
     @property
     def specialised(self) -> bool:
-        """Whether it ends with a policy for one robot, out of a policy for all."""
+        """Whether it ends with a policy for one robot."""
         return self.kind in ALONE
 
 
@@ -107,6 +123,16 @@ def _stage(cfg: ExperimentCfg, name: str, kind: Kind, env_steps: int, **rest: ob
     return Stage(name=name, kind=kind, env_steps=env_steps, **{**fields, **rest})  # type: ignore[arg-type]
 
 
+def _teacher(cfg: ExperimentCfg, number: int, robot: str, generalist: str, teacher: str) -> list[Stage]:
+    """The stages whose last one teaches a robot; none where the generalist does."""
+    if teacher == "generalist":
+        return []
+    if teacher != "specialist":
+        name = f"round{number}/teacher_{Path(robot).stem}"
+        return [_stage(cfg, name, "teacher", 0, round=number, robots=(robot,), source=teacher)]
+    return _specialist(cfg, number, robot, generalist)
+
+
 def _specialist(cfg: ExperimentCfg, number: int, robot: str, generalist: str) -> list[Stage]:
     """Training, search and correction of one specialist, whichever of them has a budget."""
     budgets: dict[Kind, int] = {
@@ -124,7 +150,9 @@ def _specialist(cfg: ExperimentCfg, number: int, robot: str, generalist: str) ->
 
 def _round(cfg: ExperimentCfg, number: int, generalist: str) -> list[Stage]:
     """Specialists and distillation of one round (lines 3-9)."""
-    specialists = [_specialist(cfg, number, robot, generalist) for robot in cfg.robots]
+    named = cfg.plan.teachers if number == 1 else ()
+    pairs = zip(cfg.robots, named or ("specialist",) * len(cfg.robots), strict=True)
+    specialists = [_teacher(cfg, number, robot, generalist, teacher) for robot, teacher in pairs]
     distill = _stage(
         cfg,
         f"round{number}/distill",
@@ -132,7 +160,7 @@ def _round(cfg: ExperimentCfg, number: int, generalist: str) -> list[Stage]:
         cfg.plan.distill_env_steps,
         round=number,
         init=generalist,
-        teachers=tuple(stages[-1].name for stages in specialists),
+        teachers=tuple(stages[-1].name if stages else generalist for stages in specialists),
         imitation="kickstart" if cfg.plan.method == "kickstarting" else "eagle",
     )
     average = _stage(cfg, f"round{number}/average", "average", 0, round=number, init=distill.name, start=generalist)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -61,7 +61,9 @@ def take_root(
     state = load_checkpoint(source).state
     symmetric, was_symmetric = cfg.algo.network.symmetric, bool(state.get("architecture", {}).get("mirror"))
     if first:
-        _tell_changed_meaning(source, was, cfg.task, changes("algo.network.symmetric", was_symmetric, symmetric))
+        tell_changed_meaning(
+            "plan.root", source, was, cfg.task, changes("algo.network.symmetric", was_symmetric, symmetric)
+        )
     new = clock_columns(cfg.task.observations) - clock_columns(was.observations)
     if new > 0 or symmetric != was_symmetric:
         about = {name: manifest[name] for name in ("iteration", "env_steps", "score")}
@@ -121,15 +123,15 @@ def widen_clock(state: dict[str, Any], columns: int) -> dict[str, Any]:
     }
 
 
-def _tell_changed_meaning(root: Path, was: TaskCfg, task: TaskCfg, more: list[str]) -> None:
-    """Say what makes a root's observations and actions mean something else here, and what ``more`` does."""
+def tell_changed_meaning(setting: str, source: Path, was: TaskCfg, task: TaskCfg, more: Sequence[str] = ()) -> None:
+    """Say what makes a policy's observations and actions mean something else here, and what ``more`` does."""
     seen = dataclasses.replace(was.observations, clock_harmonics=task.observations.clock_harmonics)
     before, now = (
         {part: dataclasses.asdict(getattr(t, part)) for part in ("control", "observations", "gait")}
         for t in (dataclasses.replace(was, observations=seen), task)
     )
-    lines = changes("task", before, now) + more
+    lines = [*changes("task", before, now), *more]
     if lines:
         listed = "\n  ".join(lines)
-        text = f"warning: plan.root {root} was trained with other values, it acts differently here:\n  {listed}"
+        text = f"warning: {setting} {source} was trained with other values, it acts differently here:\n  {listed}"
         Console(stderr=True).print(text, highlight=False, markup=False, soft_wrap=True)

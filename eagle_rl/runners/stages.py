@@ -21,6 +21,7 @@ from eagle_rl.evaluation.evaluate import MakeEnv
 from eagle_rl.runners.plan import plan_stages
 from eagle_rl.runners.provenance import Provenance
 from eagle_rl.runners.records import Record, active_stages, final_checkpoint, open_plan, read_record
+from eagle_rl.runners.teacher import open_teacher
 from eagle_rl.runners.team import Team
 from eagle_rl.runners.worker import Worker
 
@@ -70,6 +71,9 @@ def run_experiment(
         raise ConfigError(f"--jobs {jobs}: each of {team.size} data-parallel processes trains the same stage; use one.")
     provenance = dataclasses.replace(provenance or Provenance(), config=dataclasses.asdict(cfg))
     stages = plan_stages(cfg, team.size)
+    for stage in stages:
+        if stage.source and not resume:  # before anything is trained
+            open_teacher(cfg, stage, provenance.slot_table_hash)
     team.agree(lambda: open_plan(run_dir, provenance, stages, resume=resume, allow_drift=allow_drift))
     worker = Worker(cfg, stages, run_dir, make_env, provenance, team, allow_drift, jobs)
     spawn = multiprocessing.get_context("spawn")

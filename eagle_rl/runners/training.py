@@ -14,6 +14,7 @@ from eagle_rl.algorithms.specialists import SpecialistBank
 from eagle_rl.config.schema import ExperimentCfg
 from eagle_rl.evaluation.evaluate import MakeEnv, Policy
 from eagle_rl.models import EagleActor
+from eagle_rl.models.actor import ACTOR_INPUTS
 from eagle_rl.models.correction import CorrectedPolicy
 from eagle_rl.models.sides import MirrorMap
 from eagle_rl.runners.checkpoint import (
@@ -33,6 +34,7 @@ from eagle_rl.runners.plan import Stage, stage_num_envs, warm_task
 from eagle_rl.runners.provenance import Provenance
 from eagle_rl.runners.root import take_root
 from eagle_rl.runners.searching import SearchRunner
+from eagle_rl.runners.teacher import take_teacher
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,6 +80,8 @@ def train(job: Job) -> Path:
         return latest
     if job.stage.kind == "root":
         return take_root(job.cfg, checkpoints, job.provenance, lambda: _mirror(job), first=job.rank == 0)
+    if job.stage.kind == "teacher":
+        return take_teacher(job.cfg, job.stage, checkpoints, job.provenance, lambda: _columns(job), first=job.rank == 0)
     if job.stage.kind == "search":
         return _search(job, latest)
     if job.stage.kind == "correct":
@@ -98,6 +102,12 @@ def _mirror(job: Job) -> MirrorMap:
     """Left and right exchanged in what the environment shows and takes."""
     mirror: MirrorMap = job.make_env(job.cfg.robots, len(job.cfg.robots), job.cfg.task, job.stage.seed).mirror
     return mirror
+
+
+def _columns(job: Job) -> dict[str, int]:
+    """Columns of the observation groups."""
+    obs = job.make_env(job.cfg.robots, len(job.cfg.robots), job.cfg.task, job.stage.seed).get_observations()
+    return {group: obs[group].shape[1] for group in ACTOR_INPUTS}
 
 
 def _search(job: Job, latest: Path | None) -> Path:

@@ -172,6 +172,8 @@ def test_a_wrong_override_is_named_with_what_was_expected(override, expected):
         ("robots=[]", "robots: expected at least one robot"),
         ("robots=[h1, g1, h1]", "named twice: h1"),
         ("plan.method=eagle", "needs a budget for this stage"),
+        ("plan.teachers=[generalist]", "plan.teachers: 1 named, expected one for each of 5 robots"),
+        ("plan.teachers=[a, a, a, a, a]", "named, but method ppo distils no specialists"),
         ("correction.num_steps=64", "correction.num_steps: got 64, expected 65 or more, to look ahead"),
         ("search.num_steps=40", "search.num_steps: got 40, expected more than search.settling_steps, 40"),
         ("search.error_units=[0.05, 0.08, 0, 0.02, 0.04]", "expected numbers above 0"),
@@ -190,6 +192,14 @@ def test_a_search_may_take_the_place_of_specialists_training_but_not_of_residual
     assert load_experiment("eagle", overrides).plan.search_env_steps == 9
     with pytest.raises(ConfigError, match=r"plan.specialist_env_steps: 0, but method compass needs a budget"):
         load_experiment("fork_compass", overrides)
+
+
+def test_specialists_need_a_budget_only_where_some_are_trained():
+    nothing, given = "plan.specialist_env_steps=0", "generalist, generalist, generalist, generalist"
+    load_experiment("eagle", [nothing, f"plan.teachers=[{given}, a.pt]", "plan.max_rounds=1"])
+    for teachers, rounds in ((f"[{given}, specialist]", 1), (f"[{given}, a.pt]", 2), ("[]", 1)):
+        with pytest.raises(ConfigError, match=r"plan.specialist_env_steps: 0, but method eagle needs"):
+            load_experiment("eagle", [nothing, f"plan.teachers={teachers}", f"plan.max_rounds={rounds}"])
 
 
 def test_a_correction_has_passes_or_foresight_or_both():

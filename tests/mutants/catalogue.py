@@ -181,6 +181,7 @@ MUTANTS: tuple[Mutant, ...] = (
     Mutant(COMMANDS, "wins @ self._grid.neighbours", "wins", "mdp/test_commands.py"),
     Mutant(COMMANDS, "command[:, 3:] = command[:, 3:]", "command[:, 2:] = command[:, 2:]", "mdp/test_commands.py"),
     Mutant("eagle_rl/runners/following.py", ", NUM_VELOCITIES:] = 0.0", ", :] = 0.0", "runners/test_correcting.py"),
+    Mutant("eagle_rl/runners/following.py", "draw * upright // 2", "draw * upright", "runners/test_correcting.py"),
     Mutant(ACTOR, 'self.sides.mirrored("actions", head(', "(head(", "learner/test_actor.py"),
     Mutant(ACTOR, "self.sides.mirrored(group, x) for", "x for", "learner/test_actor.py"),
     Mutant(ACTOR, "0.5 * (mean +", "0.5 * (mean -", "learner/test_actor.py"),

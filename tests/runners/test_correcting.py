@@ -10,7 +10,8 @@ import torch
 
 from eagle_rl.config.schema import CorrectionCfg, ExperimentCfg
 from eagle_rl.errors import CheckpointError, EagleWarning
-from eagle_rl.models.correction import CorrectedPolicy
+from eagle_rl.evaluation.evaluate import MakeEnv
+from eagle_rl.models.correction import CorrectedPolicy, Correction
 from eagle_rl.runners import correcting
 from eagle_rl.runners.checkpoint import load_actor, load_checkpoint, load_correction, save_checkpoint
 from eagle_rl.runners.following import Followers
@@ -25,9 +26,9 @@ from tests.runners.toy_run import make_toy_env, refuse, toy_experiment, toy_job
 CORRECTION = CorrectionCfg(num_envs=64, num_steps=12, settling_steps=2, damping=0.5)
 ROLLOUT = 64 * 12
 PROBE = 3 * ROLLOUT
-"""Environment steps of a probe; six looks follow it, and gains take seven rollouts before it."""
-FORESIGHT = (2 + 2 * (1 + len(correcting.DAMPINGS))) * ROLLOUT
-"""Environment steps of a foresight: two worlds to learn from, two to see every damping in."""
+"""Environment steps of a probe; six looks of two commands follow it, and gains take seven rollouts before it."""
+FORESIGHT = (2 + 4 * (1 + len(correcting.DAMPINGS))) * ROLLOUT
+"""Environment steps of a foresight: two worlds to learn from, two to see every damping in under two commands."""
 
 
 def corrected(folder: Path, probes: int = 2, **changes: float) -> tuple[ExperimentCfg, RunResult]:
@@ -61,13 +62,13 @@ def test_a_correction_makes_robots_follow_better_and_leaves_the_network_alone(tm
 def test_its_steps_are_counted(tmp_path):
     _, result = corrected(tmp_path, probes=1)
     spent = result.records["round1/correct_one"].env_steps
-    assert spent == (7 + 3 + 6) * ROLLOUT + FORESIGHT
+    assert spent == (7 + 3 + 12) * ROLLOUT + FORESIGHT
 
 
 def test_no_gains_are_tuned_where_none_are_to_be_tried(tmp_path):
     _, result = corrected(tmp_path, probes=1, gain_std=0.0)
     record = result.records["round1/correct_one"]
-    assert record.env_steps == (3 + 6) * ROLLOUT + FORESIGHT
+    assert record.env_steps == (3 + 12) * ROLLOUT + FORESIGHT
     saved = load_correction(final_checkpoint(result.run_dir, "round1/correct_one"))
     assert saved is not None
     assert not saved.gains.any()
@@ -114,18 +115,59 @@ def test_a_foresight_that_makes_nothing_better_is_left_out(tmp_path, monkeypatch
     assert "with foresight left out" in capsys.readouterr().err
 
 
-def test_a_share_of_the_robots_is_upright_whichever_commands_are_drawn(tmp_path):
-    cfg, result = corrected(tmp_path, probes=1)
+def followers(folder: Path, make_env: MakeEnv = make_still_env) -> tuple[Followers, Correction]:
+    """Robots of the first kind, and what was found for them."""
+    cfg, result = corrected(folder, probes=1)
     one = dataclasses.replace(cfg, robots=("one",), correction=dataclasses.replace(CORRECTION, upright_share=0.25))
     path = final_checkpoint(result.run_dir, "round1/correct_one")
     correction = load_correction(path)
     assert correction is not None
-    robots = Followers(one, load_actor(path)[0], make_still_env, seed=1)
+    return Followers(one, load_actor(path)[0], make_env, seed=1), correction
+
+
+def test_a_share_of_the_robots_is_upright_whichever_commands_are_drawn(tmp_path):
+    robots, correction = followers(tmp_path)
     for number in (0, 1):
         commands = robots.follow(correction, number).command
         upright = (commands[:, 3:] == 0).all(dim=1)
         assert upright.sum() == 16, "a quarter of 64"
         assert (commands[:, :3] != 0).all()
+
+
+def test_half_of_who_was_upright_stays_so_when_the_command_changes(tmp_path):
+    robots, correction = followers(tmp_path)
+    first, second = robots.follow(correction, 0, num_commands=2).command.chunk(2)
+    assert (first[:, :3] != second[:, :3]).all(), "all velocities are drawn anew"
+    before, after = ((commands[:, 3:] == 0).all(dim=1) for commands in (first, second))
+    assert (before.sum(), after.sum(), (before & after).sum()) == (16, 16, 8)
+
+
+class TrippingToyEnv(StillToyEnv):
+    """The first robot falls at a command that is not its first, the second under its first."""
+
+    pins = 0
+
+    def pin_commands(self, command: torch.Tensor | None) -> None:
+        super().pin_commands(command)
+        self.pins += 1
+
+    def step(self, actions: torch.Tensor):
+        obs, rewards, dones, extras = super().step(actions)
+        fell = torch.zeros_like(dones)
+        fell[2 - self.pins] = 1
+        return obs, rewards, fell, extras | {"time_outs": torch.zeros_like(dones)}
+
+
+def test_who_falls_at_a_change_of_command_is_charged_for_the_second_alone(tmp_path):
+    def make_env(robots, num_envs, task, seed, first=0):
+        return TrippingToyEnv(num_envs, tuple(robots), seed)
+
+    robots, correction = followers(tmp_path, make_env)
+    found = robots.follow(correction, 0, num_commands=2)
+    assert found.fell.nonzero().flatten().tolist() == [1, 64], "the second at once, the first under its second command"
+    assert (found.cost[[1, 64]] > found.cost[[0, 65]]).all()
+    rest = robots.follow(correction, 0)
+    assert rest.fell.nonzero().flatten().tolist() == [1]
 
 
 class SpinningToyEnv(StillToyEnv):

@@ -85,6 +85,18 @@ def test_an_average_ends_a_round_and_the_next_one_starts_from_it():
     assert converged_round(list(stages.values()), records, 0.01) == 1, "a round is worth what it ends with"
 
 
+def test_teachers_are_named_for_the_first_round_by_file_or_by_who_they_are():
+    cfg = ExperimentCfg(name="x", robots=("h1", "g1", "t1"))
+    teachers = ("generalist", "a/g1.safetensors", "specialist")
+    cfg = dataclasses.replace(cfg, plan=dataclasses.replace(EAGLE, teachers=teachers, max_rounds=2))
+    stages = {stage.name: stage for stage in plan_stages(cfg)}
+    assert stages["round1/distill"].teachers == ("generalist", "round1/teacher_g1", "round1/specialist_t1")
+    given = stages["round1/teacher_g1"]
+    assert (given.source, given.robots, given.inputs, given.iterations) == ("a/g1.safetensors", ("g1",), (), 0)
+    assert given.specialised
+    assert stages["round2/distill"].teachers == tuple(f"round2/specialist_{robot}" for robot in cfg.robots)
+
+
 def test_inputs_come_before_the_stages_that_need_them():
     seen: set[str] = set()
     for stage in plan():
