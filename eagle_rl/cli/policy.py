@@ -47,7 +47,7 @@ def load_policy(path: Path, device: str = "cpu") -> Policy:
     from eagle_rl.config.load import experiment_from_plain
     from eagle_rl.models.correction import CorrectedPolicy
     from eagle_rl.models.precision import set_up_torch
-    from eagle_rl.runners.checkpoint import load_actor, load_correction
+    from eagle_rl.runners.checkpoint import load_actor, load_correction, require_whole
     from eagle_rl.runners.judged import training_steps
     from eagle_rl.runners.locate import find_checkpoint
     from eagle_rl.runners.provenance import slot_table_hash
@@ -57,6 +57,7 @@ def load_policy(path: Path, device: str = "cpu") -> Policy:
     require_device(device)
     checkpoint = find_checkpoint(path)
     actor, manifest = load_actor(checkpoint, device, slot_table_hash(SLOT_NAMES))
+    require_whole(checkpoint, manifest)
     cfg = experiment_from_plain(manifest["config"], str(checkpoint))
     set_up_torch(1)  # a forward pass is little beside the physics, and waiting threads take the cores from it
     run = dataclasses.replace(cfg.run, device=device, env_device=device, num_threads=0)

@@ -137,6 +137,19 @@ def load_actor(
     return actor.to(device).eval(), manifest
 
 
+def require_whole(path: Path, manifest: Manifest) -> None:
+    """Refuse a residual specialist, whose actions mean nothing without those of the base they are added to.
+
+    Raises:
+        CheckpointError: it is one.
+    """
+    if str(manifest.get("stage")).startswith("compass/residual_"):
+        raise CheckpointError(
+            f"{path}: a residual specialist of COMPASS, which acts only on top of its base, expected a whole policy. "
+            "How it follows stands in its stage's evaluation.json; compass/distill has learned what it does."
+        )
+
+
 def load_correction(path: Path, device: str | torch.device = "cpu") -> Correction | None:
     """What the policy of a checkpoint or of a published file is corrected by, if anything."""
     path = Path(path)

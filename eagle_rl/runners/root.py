@@ -17,7 +17,13 @@ from eagle_rl.config.schema import ExperimentCfg, ObservationsCfg, TaskCfg
 from eagle_rl.errors import CheckpointError
 from eagle_rl.models.actor import SIDED_GROUPS
 from eagle_rl.models.sides import MirrorMap, Sides
-from eagle_rl.runners.checkpoint import load_checkpoint, load_correction, save_checkpoint, verify_checkpoint
+from eagle_rl.runners.checkpoint import (
+    load_checkpoint,
+    load_correction,
+    require_whole,
+    save_checkpoint,
+    verify_checkpoint,
+)
 from eagle_rl.runners.files import write_atomically
 from eagle_rl.runners.locate import find_checkpoint
 from eagle_rl.runners.provenance import Provenance, changes
@@ -52,6 +58,7 @@ def take_root(
     if source.suffix == SUFFIX:
         raise CheckpointError(f"plan.root: {source}: a published policy has no critic to go on from; use a checkpoint.")
     manifest = verify_checkpoint(source)
+    require_whole(source, manifest)
     if load_correction(source) is not None:
         raise CheckpointError(
             f"plan.root: {source}: a corrected specialist, which no training can go on from: its correction is no part "

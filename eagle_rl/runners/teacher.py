@@ -11,7 +11,7 @@ from eagle_rl.config.schema import ExperimentCfg
 from eagle_rl.errors import CheckpointError, did_you_mean
 from eagle_rl.models import EagleActor
 from eagle_rl.models.actor import ACTOR_INPUTS
-from eagle_rl.runners.checkpoint import Manifest, load_actor, load_correction, save_checkpoint
+from eagle_rl.runners.checkpoint import Manifest, load_actor, load_correction, require_whole, save_checkpoint
 from eagle_rl.runners.locate import find_checkpoint
 from eagle_rl.runners.plan import TEACHERS, Stage
 from eagle_rl.runners.provenance import Provenance
@@ -30,6 +30,7 @@ def open_teacher(cfg: ExperimentCfg, stage: Stage, slot_table_hash: str) -> tupl
         raise CheckpointError(f"plan.teachers: got {named!r}, expected {words}.{did_you_mean(named, TEACHERS)}")
     source = find_checkpoint(Path(named))
     actor, manifest = load_actor(source, slot_table_hash=slot_table_hash)
+    require_whole(source, manifest)
     if robot not in manifest["robots"]:
         of = ", ".join(manifest["robots"])
         raise CheckpointError(

@@ -8,6 +8,8 @@ import pytest
 import torch
 
 from eagle_rl.algorithms.specialists import SpecialistBank
+from eagle_rl.cli.policy import load_policy
+from eagle_rl.errors import CheckpointError
 from eagle_rl.runners.checkpoint import load_actor
 from eagle_rl.runners.compass import (
     DemonstrationEnv,
@@ -17,18 +19,22 @@ from eagle_rl.runners.compass import (
     begin_residual,
     mean_actions,
 )
+from eagle_rl.runners.provenance import Provenance, slot_table_hash
 from eagle_rl.runners.records import stage_dir
 from eagle_rl.runners.stages import run_experiment
+from envs.robots.slots import SLOT_NAMES
 from tests.runners.toy_run import make_toy_env, toy_experiment
 from tests.toy import NUM_SLOTS
 
 ROBOTS = ("one", "two", "three")
+OURS = Provenance(slot_table_hash=slot_table_hash(SLOT_NAMES))
+"""So that commands take the toys' checkpoints, too."""
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     cfg = toy_experiment(iterations=2, judge_envs=2, method="compass")
-    return run_experiment(cfg, tmp_path_factory.mktemp("run"), make_toy_env)
+    return run_experiment(cfg, tmp_path_factory.mktemp("run"), make_toy_env, provenance=OURS)
 
 
 @pytest.fixture
@@ -53,6 +59,22 @@ def test_all_three_stages_end_in_one_policy(run):
         "compass/distill",
     ]
     assert run.generalist.parent.parent == stage_dir(run.run_dir, "compass/distill")
+
+
+def test_a_residual_is_refused_where_a_whole_policy_is_needed(run, tmp_path):
+    """By itself it would be judged, taught from and trained on as if its additions were actions."""
+    path = run.run_dir / run.records["compass/residual_one"].checkpoint
+    starts = {"root": str(path), "method": "ppo"}, {"teachers": (str(path), "generalist", "generalist")}
+    users = [
+        lambda: load_policy(path),
+        *(
+            lambda plan=plan: run_experiment(toy_experiment(**plan), tmp_path / "on", make_toy_env, provenance=OURS)
+            for plan in starts
+        ),
+    ]
+    for use in users:
+        with pytest.raises(CheckpointError, match="a residual specialist of COMPASS, which acts only on top of its"):
+            use()
 
 
 def test_the_base_policy_reads_a_prediction_of_the_next_frame(actors):
@@ -135,7 +157,7 @@ def test_on_a_root_residuals_begin_with_its_critic_and_the_result_has_its_shape(
     root = run.run_dir / run.records["generalist"].checkpoint
     cfg = toy_experiment(iterations=1, judge_envs=0, method="compass", base_env_steps=0, root=str(root))
     frozen = replace(cfg, algo=replace(cfg.algo, critic_learning_rate=1e-12))
-    result = run_experiment(frozen, tmp_path / "run", make_toy_env)
+    result = run_experiment(frozen, tmp_path / "run", make_toy_env, provenance=OURS)
     learners = [torch.load(path, weights_only=True)["algorithm"] for path in (root, _final(result, "residual_one"))]
     for key, x in learners[0]["critic_state_dict"].items():
         torch.testing.assert_close(learners[1]["critic_state_dict"][key], x, msg=f"critic's {key} is not the root's")
