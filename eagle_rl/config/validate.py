@@ -227,8 +227,9 @@ def _plan_faults(cfg: ExperimentCfg) -> Iterator[Fault]:
     if plan.method != "ppo":
         others = 0 if plan.method == "compass" else plan.search_env_steps + plan.correction_env_steps
         specialists = plan.specialist_env_steps + others
-        budgets = {"specialist_env_steps": specialists, "distill_env_steps": plan.distill_env_steps}
-        for key in (key for key, budget in budgets.items() if budget == 0 and (own or key != "specialist_env_steps")):
+        budgets = {"specialist_env_steps": specialists} if own else {}
+        budgets["distill_env_steps"] = plan.distill_env_steps
+        for key in (key for key, budget in budgets.items() if budget == 0):
             yield f"plan.{key}", f"0, but method {plan.method} needs a budget for this stage"
     for name, rollout in (("search", cfg.search), ("correction", cfg.correction)):
         steps, settling = rollout.num_steps, rollout.settling_steps

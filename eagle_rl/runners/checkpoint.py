@@ -26,6 +26,7 @@ from eagle_rl.models import EagleActor
 from eagle_rl.models.correction import Correction
 from eagle_rl.runners import published
 from eagle_rl.runners.files import write_atomically
+from eagle_rl.runners.plan import RESIDUAL
 from eagle_rl.runners.provenance import Provenance
 
 FORMAT_VERSION = 1
@@ -143,7 +144,7 @@ def require_whole(path: Path, manifest: Manifest) -> None:
     Raises:
         CheckpointError: it is one.
     """
-    if str(manifest.get("stage")).startswith("compass/residual_"):
+    if str(manifest.get("stage")).startswith(RESIDUAL):
         raise CheckpointError(
             f"{path}: a residual specialist of COMPASS, which acts only on top of its base, expected a whole policy. "
             "How it follows stands in its stage's evaluation.json; compass/distill has learned what it does."

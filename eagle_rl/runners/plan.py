@@ -30,6 +30,9 @@ Kind = Literal[
 ]
 Imitation = Literal["eagle", "kickstart"]
 
+RESIDUAL = "compass/residual_"
+"""What the name of a COMPASS specialist's stage begins with."""
+
 TEACHERS = ("specialist", "generalist")
 """What ``plan.teachers`` may name beside files."""
 
@@ -185,7 +188,7 @@ def _compass(cfg: ExperimentCfg, demonstrator: str) -> list[Stage]:
     residuals = [
         _stage(
             cfg,
-            f"compass/residual_{Path(robot).stem}",
+            f"{RESIDUAL}{Path(robot).stem}",
             "residual",
             plan.specialist_env_steps,
             round=1,
