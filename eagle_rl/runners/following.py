@@ -127,8 +127,8 @@ class Followers:
     def _walk(
         self, number: int, ev: EvaluationCfg, act: Callable[[TensorDict], Tensor], num_commands: int = 1
     ) -> Iterator[_Step]:
-        """Step robots from rest, ``correction.num_steps`` for every command."""
-        env = self.env(self.cfg.correction.num_envs, ev)
+        """Step robots from rest, ``correction.num_steps`` for every command, with no time-out in between."""
+        env = self.env(self.cfg.correction.num_envs, replace(ev, num_steps=num_commands * ev.num_steps))
         for commands in self._commands(number, num_commands).unbind(dim=1):
             env.pin_commands(commands)
             obs = env.get_observations()

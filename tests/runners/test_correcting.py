@@ -142,6 +142,18 @@ def test_half_of_who_was_upright_stays_so_when_the_command_changes(tmp_path):
     assert (before.sum(), after.sum(), (before & after).sum()) == (16, 16, 8)
 
 
+def test_robots_walk_from_one_command_into_the_next(tmp_path):
+    lengths = []
+
+    def make_env(robots, num_envs, task, seed, first=0):
+        lengths.append(round(task.terminations.episode_length_s / 0.02))
+        return StillToyEnv(num_envs, tuple(robots), seed)
+
+    robots, correction = followers(tmp_path, make_env)
+    robots.follow(correction, 0, num_commands=2)
+    assert lengths[-1] > 2 * CORRECTION.num_steps, "a time-out before would put them back at rest"
+
+
 class TrippingToyEnv(StillToyEnv):
     """The first robot falls at a command that is not its first, the second under its first."""
 
