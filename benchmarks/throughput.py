@@ -18,41 +18,35 @@ from eagle_rl.runners.on_policy import EagleRunner
 from eagle_rl.threads import use_threads
 
 from .budget import Budget
-from .measure import Cost, Figure, in_turns, milliseconds
-from .workloads import BarePhysics, Stepping, experiment, make_env, make_runner
+from .measure import Figure, in_turns, milliseconds
+from .workloads import BarePhysics, Stepping, experiment, make_env, make_runner, step_costs
 
 
 def environment(num_envs: int, threads: int, seconds: float, bar: str) -> list[Figure]:
     """Rate of the whole environment step as a share of the bare physics' rate, as measured and as the CPU time says."""
-    env = make_env(experiment(threads), num_envs)
-    costs = BarePhysics(env).in_turns_with(Stepping(env).step, seconds)
-    step, bare = costs["step"], costs["bare"]
+    cost = step_costs({"pool": make_env(experiment(threads), num_envs)}, seconds)["pool"]
+    step, bare = cost.step, cost.bare
     name = f"environment step / bare physics, {num_envs} envs"
     detail = milliseconds(step=step.wall, bare=bare.wall)
     ideal = bare.cpu / threads
-    overhead = max(0.0, step.cpu - bare.cpu)
-    cpu_detail = milliseconds(cpu_step=step.cpu, cpu_bare=bare.cpu) + f", {1e6 * overhead / num_envs:.1f} us an env"
+    cpu_detail = (
+        milliseconds(cpu_step=step.cpu, cpu_bare=bare.cpu) + f", {1e6 * cost.overhead / num_envs:.1f} us an env"
+    )
     return [
         Figure(name, bare.wall / step.wall, "x", bar, detail),
-        Figure(f"{name}, from CPU time", ideal / (ideal + overhead), "x", bar, cpu_detail),
+        Figure(f"{name}, from CPU time", ideal / (ideal + cost.overhead), "x", bar, cpu_detail),
     ]
 
 
 def pooling(num_envs: int, threads: int, seconds: float) -> list[Figure]:
-    """Five robots pooled against one robot at a time with as many environments, each weighted by its physics."""
+    """Five robots pooled against one robot at a time with as many environments: both beside the pool's own physics."""
     cfg = experiment(threads)
-    costs: dict[str, dict[str, Cost]] = {}
-    for name in (*cfg.robots, "pool"):
-        env = make_env(cfg, num_envs, None if name == "pool" else (name,))
-        costs[name] = BarePhysics(env).in_turns_with(Stepping(env).step, seconds / 6)
-
-    def overhead(name: str) -> float:
-        return costs[name]["step"].cpu - costs[name]["bare"].cpu
-
-    alone = sum(overhead(name) for name in cfg.robots) / len(cfg.robots)
-    physics = costs["pool"]["bare"].cpu / threads
-    ratio = (physics + alone) / (physics + overhead("pool"))
-    detail = milliseconds(pool_overhead=overhead("pool"), mean_overhead_alone=alone, physics=physics)
+    envs = {name: make_env(cfg, num_envs, (name,)) for name in cfg.robots} | {"pool": make_env(cfg, num_envs)}
+    costs = step_costs(envs, seconds)
+    alone = sum(costs[name].overhead for name in cfg.robots) / len(cfg.robots)
+    pool, physics = costs["pool"].overhead, costs["pool"].bare.cpu / threads
+    ratio = (physics + alone) / (physics + pool)
+    detail = milliseconds(pool_overhead=pool, mean_overhead_alone=alone, physics=physics)
     return [Figure("five robots pooled / one robot, same physics", ratio, "x", ">= 0.95", detail)]
 
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -103,18 +103,42 @@ class BarePhysics:
                 batch.overwrite(state)
             self._present = None
 
-    def in_turns_with(self, step: Callable[[], object], seconds: float, warm_up: int = 3) -> dict[str, Cost]:
-        """Costs of the environment's ``step`` and of its ``bare`` physics."""
+    def begin(self) -> None:
+        """Make ready for a step of the environment."""
+        self.return_to_present()
+        self.remember()
 
-        def begin() -> None:
-            self.return_to_present()
-            self.remember()
+    def again(self) -> None:
+        """Make ready for the same step by physics alone."""
+        self.remember_targets()
+        self.rewind()
 
-        def again() -> None:
-            self.remember_targets()
-            self.rewind()
 
-        return in_turns({"step": step, "bare": self.step}, seconds, warm_up, {"step": begin, "bare": again})
+@dataclass(frozen=True)
+class StepCost:
+    """What a step of an environment costs."""
+
+    step: Cost
+    """With everything that belongs to it."""
+    bare: Cost
+    """Its physics alone."""
+
+    @property
+    def overhead(self) -> float:
+        """What comes on top of physics, CPU time [s]."""
+        return max(0.0, self.step.cpu - self.bare.cpu)
+
+
+def step_costs(envs: Mapping[str, HumanoidEnv], seconds: float) -> dict[str, StepCost]:
+    """Costs of steps of several environments and of their bare physics, measured all in turn."""
+    actions: dict[str, Callable[[], object]] = {}
+    before: dict[str, Callable[[], object]] = {}
+    for name, env in envs.items():
+        bare = BarePhysics(env)
+        actions |= {f"{name} step": Stepping(env).step, f"{name} bare": bare.step}
+        before |= {f"{name} step": bare.begin, f"{name} bare": bare.again}
+    costs = in_turns(actions, seconds, before=before)
+    return {name: StepCost(costs[f"{name} step"], costs[f"{name} bare"]) for name in envs}
 
 
 def make_runner(cfg: ExperimentCfg, env: HumanoidEnv) -> EagleRunner:

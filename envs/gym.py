@@ -36,11 +36,12 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 from tensordict import TensorDict
 
-from eagle_rl.config.schema import AidsCfg, ObservationsCfg, TaskCfg
+from eagle_rl.config.schema import AidsCfg, CommandCurriculumCfg, CommandsCfg, ObservationsCfg, RewardsCfg, TaskCfg
 from eagle_rl.errors import ConfigError
 
 from .humanoid_env import HumanoidEnv
 from .mdp.layout import ObservationLayout
+from .pooling import share
 from .rendering.offscreen import Frame, OffscreenRenderer
 from .rendering.scene import Stage
 from .robots.load import load_robot
@@ -48,8 +49,12 @@ from .robots.slots import NUM_SLOTS
 
 OBSERVATION_GROUPS = ("history", "command", "clock", "slot_mask")
 ENV_ID = "eagle/Humanoid-v0"
-DEFAULT_TASK = TaskCfg(aids=AidsCfg(harness=0.0, gait_shaping=0.0))
-"""The task without learning aids, which would change with training."""
+DEFAULT_TASK = TaskCfg(
+    aids=AidsCfg(harness=0.0, gait_shaping=0.0),
+    rewards=RewardsCfg(penalty_initial=1.0),
+    commands=CommandsCfg(curriculum=CommandCurriculumCfg(enabled=False)),
+)
+"""The task without learning aids and curricula, so that it is the same whenever it is built anew."""
 ACTION_UNIT = 4.0
 """Task action at the bound of the action space [-]: about 1 rad of PD target."""
 
@@ -100,6 +105,7 @@ class _Simulation:
             raise ResetNeeded("call env.reset() before env.step()")
         return self._env
 
+    @torch.inference_mode(False)  # what is written in place must not be an inference tensor
     def reset(self, seed: int | None, generator: np.random.Generator) -> TensorDict:
         """Start new episodes; with a seed, or the first time, also new random streams."""
         if seed is not None or self._env is None:
@@ -110,6 +116,7 @@ class _Simulation:
             self._env.reset()
         return self.env.get_observations()
 
+    @torch.inference_mode(False)
     def step(self, actions: Array) -> tuple[TensorDict, Array, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
         """Observations after resets, rewards, terminations, truncations, extras."""
         groups, rewards, dones, extras = self.env.step(ACTION_UNIT * torch.as_tensor(actions))
@@ -139,18 +146,22 @@ class HumanoidGymEnv(gymnasium.Env[Any, Any]):
         self.observation_space = observation_space(self._sim.task.observations)
         self.action_space = action_space()
         self._renderer: OffscreenRenderer | None = None
+        self._pose: NDArray[np.float64] | None = None
+        """In which the episode ended, if it did: the simulation has begun the next one."""
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
         """Start a new episode."""
         super().reset(seed=seed)
+        self._pose = None
         return self._row(self._sim.reset(seed, self.np_random))
 
     def step(self, action: Array) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Advance 0.02 s; after the end of an episode the observation is the true last one."""
         groups, rewards, terminations, truncations, extras = self._sim.step(action[None])
         ended = bool(terminations[0] or truncations[0])
+        self._pose = extras["final_poses"][0] if ended else None
         observation, info = self._row(extras["final_observations"] if ended else groups)
         return observation, float(rewards[0]), bool(terminations[0]), bool(truncations[0]), info
 
@@ -160,7 +171,7 @@ class HumanoidGymEnv(gymnasium.Env[Any, Any]):
             return None
         if self._renderer is None:
             self._renderer = OffscreenRenderer(Stage(self._sim.specs), 640, 480)
-        self._renderer.show([self._sim.env.pool.batches[0].qpos[0]])
+        self._renderer.show([self._sim.env.pool.batches[0].qpos[0] if self._pose is None else self._pose])
         return self._renderer.frame()
 
     def close(self) -> None:
@@ -180,7 +191,7 @@ class HumanoidVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
 
     def __init__(
         self,
-        num_envs: int = 1,
+        num_envs: int = 5,
         robots: Sequence[str] = ("h1", "g1", "t1", "n1", "adam"),
         task: TaskCfg | None = None,
         num_threads: int = 0,
@@ -188,11 +199,12 @@ class HumanoidVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         """Describe the environments; they are built by the first reset.
 
         Args:
-            num_envs: environments over all robots, N.
+            num_envs: environments over all robots, N; ``gymnasium.make_vec`` says 1 unless told otherwise.
             robots: robots by name or by the path of a YAML file.
             task: the Markov decision process, :data:`DEFAULT_TASK` unless given.
             num_threads: physics threads, 0 for one per core.
         """
+        share(num_envs, len(robots))  # refused here already, if they are too few
         self.num_envs = num_envs
         self._sim = _Simulation(robots, task, num_envs, num_threads)
         self.single_observation_space = observation_space(self._sim.task.observations)

@@ -140,6 +140,7 @@ class HumanoidEnv(ControlStep, VecEnv):
         self.phase = torch.zeros(n, dtype=dtype, device=device)
         zeros = torch.zeros(n, NUM_SLOTS, dtype=dtype, device=device)
         self._actions = self._last_actions = self._last_last_actions = zeros
+        self._harness: Tensor | None = None
         self._weigh()
         self._compile_at: int | None = None
         self._forget()
@@ -158,7 +159,8 @@ class HumanoidEnv(ControlStep, VecEnv):
         Returns:
             Observations after resets, rewards (N,), dones (N,), and extras with ``time_outs``, ``log``, how long the
             physics took [s] (``physics_time``), and ``final_observations`` of the environments ``final_ids``, whose
-            returns are to end there and be bootstrapped: they timed out, or get a new command or a push next.
+            returns are to end there and be bootstrapped: they timed out, or get a new command or a push next. With
+            ``final_of_episodes`` those whose episodes end, and ``final_poses``, the ``qpos`` of each.
         """
         if self._compile_at is not None and self.common_step_counter >= self._compile_at:
             self._compile_at = None
@@ -178,6 +180,8 @@ class HumanoidEnv(ControlStep, VecEnv):
             self.pool.keep_faults()
         extras: dict[str, Any] = {"time_outs": time_outs, "physics_time": self._physics_time}
         extras |= self._final(dones, any_done) if self.final_of_episodes else self._final(judged.cut, any_cut)
+        if self.final_of_episodes:
+            extras["final_poses"] = self.pool.poses(extras["final_ids"])
         extras["log"] = self._account()
         if any_done:
             reset_ids = dones.nonzero().squeeze(1)
@@ -203,11 +207,11 @@ class HumanoidEnv(ControlStep, VecEnv):
     def reset(self) -> None:
         """Start new episodes everywhere; random streams go on."""
         self._forget()
-        self.pool.staged = self.pool.staged.clone()  # what was handed out keeps its values
+        self.pool.staged, self.history.frames = self.pool.staged.clone(), self.history.frames.clone()  # as handed out
         self._reset(self._all, torch.zeros_like(self._all, dtype=torch.bool))
 
     def get_observations(self) -> TensorDict:
-        """Observation groups at the present state, fresh tensors."""
+        """Observation groups at the present state; they keep their values when the environment moves on."""
         if self._groups is None:
             self._groups = self._derive_groups()
         own = {"history": self.history.flat, "slot_mask": self.robots.slot_mask, "phase": self.phase}
@@ -258,7 +262,9 @@ class HumanoidEnv(ControlStep, VecEnv):
         robot, dtype = self.robots.robot_id, self.command.dtype
         self._gait_shaping = self.aids.gait_shaping[robot].to(dtype)
         harness = self.aids.harness[robot].to(dtype)
-        self._harness = harness if harness.any() else None
+        held, self._harness = self._harness is not None, harness if harness.any() else None
+        if held and self._harness is None:
+            self.pool.release()
         if self.task.aids.harness > 0:
             self.pool.set_base_damping(harness_damping(self.robots, harness))
 

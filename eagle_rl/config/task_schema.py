@@ -307,7 +307,7 @@ class RandomizationCfg:
     motor_offset: Range = (-0.02, 0.02)
     """Offset of the PD target per joint [rad], each reset."""
     sensing_latency_s: Range = (0.0, 0.02)
-    """Age of the proprioception [s], per environment, each reset."""
+    """Age of the proprioception [s], per environment, each reset; at most a control step."""
     link_mass_scale: Range = (0.8, 1.2)
     """Factor on each link's mass and inertia, at creation."""
     link_com_offset: Range = (-0.01, 0.01)
@@ -329,7 +329,7 @@ class RandomizationCfg:
     init_root_vel: Range = (-0.5, 0.5)
     """Root linear [m/s] and angular [rad/s] velocity per axis at reset."""
     morphology_length_scale: Range = (1.0, 1.0)
-    """Factor on link lengths, with mass and inertia following (ours, off: the paper's outlook)."""
+    """Factor on link lengths, inertia following by its square, mass not (ours, off: the paper's outlook)."""
     morphology_mass_scale: Range = (1.0, 1.0)
     """Factor on the mass of the whole body (ours, off)."""
 
@@ -343,7 +343,7 @@ class AidsCfg:
     harness_decay: float = 0.02
     """Relative decay per ``interval_steps`` while episodes are long."""
     gait_shaping: float = 1.0
-    """Start scale s of the softened contact kernel, kappa = 50 + 1e4 s, weights x (1 + 2 s); 0 is off."""
+    """Start scale s of the softened contact kernel, kappa = 50 + 1e4 s for 33 kg, weights x (1 + 2 s); 0 is off."""
     gait_shaping_decay: float = 0.02
     """Relative decay of gait shaping per ``interval_steps`` while contacts match the clock."""
     interval_steps: int = 24

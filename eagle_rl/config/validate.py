@@ -71,7 +71,10 @@ BOUNDS |= dict.fromkeys(
     """.split(),
     _POSITIVE_SHARE,
 )
-BOUNDS["task.gait.stance_ratio"] = _OPEN_SHARE
+BOUNDS["task.gait.stance_ratio"] = (
+    "at least 0.35 and below 1: standing is phase 0.25, and is to be stance",
+    lambda x: 0.35 <= x < 1,
+)
 BOUNDS["task.control.posture_reference"] = ("from 0 to 1.5", lambda x: 0 <= x <= 1.5)
 
 CEILINGS: dict[str, float] = {
@@ -190,6 +193,12 @@ def _task_faults(cfg: ExperimentCfg) -> Iterator[Fault]:
         yield from _curriculum_faults("task.commands.ang_vel_z", task.commands.ang_vel_z)
     yield from _scan_faults("task.observations.scan_x", task.observations.scan_x)
     yield from _scan_faults("task.observations.scan_y", task.observations.scan_y)
+    latency = task.randomization.sensing_latency_s
+    if latency[0] < 0.0 or latency[1] > CONTROL_STEP:
+        yield (
+            "task.randomization.sensing_latency_s",
+            f"got {list(latency)}, expected from 0 to {CONTROL_STEP} s, a control step",
+        )
     if task.observations.descriptor == "extended" and not task.observations.embodiment_observation:
         yield "task.observations.descriptor", "extended needs embodiment_observation: true"
     if task.terrain.cell_size > task.terrain.patch_size:

@@ -44,7 +44,7 @@ class TrackingEnv(Protocol):
         """Advance one control step: observations, rewards, dones and extras with ``time_outs``."""
 
     def tracking_errors(self) -> Tensor:
-        """Absolute errors of the last step, before any reset, shape (N, 5)."""
+        """Absolute errors at the present state, shape (N, 5); of who has just fallen, those of the new episode."""
 
 
 class MakeEnv(Protocol):

@@ -123,7 +123,7 @@ def _support(state: PooledState, robots: PooledRobots) -> Tensor:
 
 
 def harness_wrench(state: PooledState, robots: PooledRobots, scale: Tensor) -> Tensor:
-    """Help of the virtual harness: upright as commanded, carried by at most half the weight, mildly dragged along.
+    """Help of the virtual harness: upright as commanded, carried by at most 0.6 of the weight, mildly dragged along.
 
     Args:
         state: state before the control step.

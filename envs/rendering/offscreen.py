@@ -23,7 +23,7 @@ Frame = NDArray[np.uint8]
 _LABEL_RGBA = np.array([0.15, 0.2, 0.28, 1.0], np.float32)
 
 _HELP = (
-    "Pictures need OpenGL without a display, and this machine has neither EGL nor OSMesa that works: install one, "
+    "Pictures need OpenGL without a display, which does not work here (tried: {tried}). Install EGL or OSMesa, "
     "for example `apt-get install libegl1 libgl1-mesa-dri` (or `libosmesa6`)."
 )
 
@@ -58,7 +58,7 @@ def open_context(width: int, height: int) -> _Context:
     contexts = (_open_backend(backend, width, height) for backend in gl_backends())
     context = next((found for found in contexts if found is not None), None)
     if context is None:
-        raise RenderingError(_HELP)
+        raise RenderingError(_HELP.format(tried=", ".join(gl_backends()) or "nothing, neither is installed"))
     return context
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -127,6 +128,9 @@ class _Draft:
             if key not in known:
                 self.faults.append(f"unknown key {key!r}.{did_you_mean(str(key), known)}")
         self.faults += [f"key {key!r} is missing" for key in REQUIRED if key not in self.data]
+        name = self.data.get("name", "unnamed")
+        if not isinstance(name, str) or not re.fullmatch(r"\w[\w.-]*", name):
+            self.faults.append(f"name is {name!r:.80}, expected letters, digits, - and _: files are named after it")
 
     def _path(self, key: str) -> Path:
         """A path given relative to the YAML."""
@@ -248,7 +252,7 @@ class _Draft:
         where = f"joints.{name}"
         entry = self._mapping(entry, where, ("slot", *JOINT_NUMBERS))
         slot = entry.get("slot")
-        if slot not in SLOT_INDEX:
+        if not isinstance(slot, str) or slot not in SLOT_INDEX:
             self.faults.append(f"{where}.slot: unknown slot {slot!r:.80}.{did_you_mean(str(slot), SLOT_NAMES)}")
         numbers = [self._number(entry.get(key, 1.0), f"{where}.{key}", lower) for key, lower in JOINT_NUMBERS.items()]
         if numbers[0] not in (1.0, -1.0):
@@ -265,6 +269,7 @@ def consistency_faults(spec: RobotSpec, tree: Tree) -> list[str]:
         )
         if not lower <= angle <= upper
     ]
+    faults += _swapped_sides(spec, tree)
     faults += _asymmetries(spec)
     height = default_height(spec, tree)
     if abs(height - spec.nominal_height) > HEIGHT_TOLERANCE:
@@ -280,6 +285,22 @@ def default_height(spec: RobotSpec, tree: Tree) -> float:
     poses = tree.forward(spec.default_joint_pos)
     feet = [poses[spec.link_roles[f"{side}_foot"]] for side in FEET]
     return -min(float(foot.apply(sole)[2]) for foot, sole in zip(feet, spec.sole_offsets, strict=True))
+
+
+def _swapped_sides(spec: RobotSpec, tree: Tree) -> list[str]:
+    """Roles of which the left link is not to the left of the right one: all that is left or right would be mixed up."""
+    poses, links = tree.forward(spec.default_joint_pos), spec.link_roles
+    points = {role: np.zeros(3) for role in links} | {
+        f"{side}_foot": sole for side, sole in zip(FEET, spec.sole_offsets, strict=True)
+    }
+    across = {role: float(poses[link].apply(points[role])[1]) for role, link in links.items()}
+    parts = [role.removeprefix("left_") for role in links if role.startswith("left_")]
+    return [
+        f"roles: left_{part} is at y = {across[f'left_{part}']:.3f} m in the default pose and right_{part} at "
+        f"{across[f'right_{part}']:.3f} m, expected the left one at the larger y; are they swapped?"
+        for part in parts
+        if across[f"left_{part}"] <= across[f"right_{part}"]
+    ]
 
 
 def _asymmetries(spec: RobotSpec) -> list[str]:

@@ -116,7 +116,7 @@ class RobotBatch:
         return self._own_fields[name]
 
     def apply_base_wrench(self, wrench: Array) -> None:
-        """Hold a world-frame force [N] and torque [N m] on every base until the next call, shape (n, 6)."""
+        """Hold a world-frame force [N] and torque [N m] on every base until the next call, shape (n, 6) or (6,)."""
         self._xfrc[:, self._base] = wrench
 
     def set_base_damping(self, damping: Array) -> None:

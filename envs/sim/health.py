@@ -129,6 +129,6 @@ class FlightRecorder:
         self._age[envs] = 0
 
     def last(self, env: int) -> Array:
-        """Rows of the steps of one environment since it began, oldest first, shape (k, width), k at most ``LENGTH``."""
-        count = min(self.LENGTH, int(self._age[env]))
+        """Where one environment began and its steps since, oldest first, shape (k, width), k at most ``LENGTH``."""
+        count = min(self.LENGTH, int(self._age[env]) + 1)
         return self._rows[np.arange(self._latest - count + 1, self._latest + 1) % self.LENGTH, env]

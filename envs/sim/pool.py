@@ -21,7 +21,7 @@ from eagle_rl.machine import usable_cores
 from eagle_rl.threads import Threads
 
 from ..pooling import share
-from ..robots.spec import RobotSpec
+from ..robots.spec import Array, RobotSpec
 from .batch import Ids, RobotBatch
 from .health import CAUSES, FlightRecorder, diagnose
 from .staging import Staging, native_targets
@@ -165,6 +165,10 @@ class PhysicsPool:
             self._split = ids, parts
         return self._split[1]
 
+    def poses(self, ids: Tensor) -> list[Array]:
+        """Native ``qpos`` of some environments, sorted pool rows, one each."""
+        return [self.batches[part].qpos[env].copy() for part, local, _ in self.split(ids) for env in local]
+
     def place(self, ids: Tensor, root: Tensor, joint_pos: Tensor, joint_vel: Tensor) -> None:
         """Write states; :meth:`staging_rows` are what to :meth:`restage` then.
 
@@ -201,6 +205,11 @@ class PhysicsPool:
         linear, angular = (x.to("cpu", torch.float64).numpy() for x in (lin_vel_w, ang_vel_b))
         for part, local, at in self.split(ids):
             self.batches[part].push(local, linear[at], angular[at])
+
+    def release(self) -> None:
+        """Let go of the bases, which the last wrench would otherwise hold until their episodes end."""
+        for batch in self.batches:
+            batch.apply_base_wrench(np.zeros(6))
 
     def set_base_damping(self, damping: Tensor) -> None:
         """Set the damping of every base's rotation [N m s/rad], shape (N,)."""

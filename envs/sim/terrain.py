@@ -1,6 +1,7 @@
 """Uneven ground in patches: levels of growing difficulty along x, variants of each level along y (HugWBC 8).
 
-Every kind of patch is flat in the middle, where robots start, and level with its neighbours at the edge.
+Slopes and steps are flat in the middle, where robots start, and level with their neighbours at the edge. Rough ground
+is rough everywhere, and grows in height at the seam between two levels.
 """
 
 from __future__ import annotations

@@ -83,6 +83,7 @@ def test_scale_paper_has_4096_environments_and_hugwbcs_ppo():
     assert cfg.num_envs == 4096
     assert (cfg.algo.num_learning_epochs, cfg.algo.num_mini_batches, cfg.algo.entropy_coef) == (5, 4, 0.01)
     assert cfg.algo.learning_rate_range == (1e-5, 1e-2)
+    assert (cfg.algo.lam, cfg.algo.desired_kl) == (0.95, 0.01)
 
 
 def test_later_layers_win_file_then_scale_then_command_line():
@@ -158,6 +159,8 @@ def test_a_wrong_override_is_named_with_what_was_expected(override, expected):
         ("task.rewards.weights.termination=200", "expected 0 or less, it is a penalty"),
         ("task.rewards.weights.alive=-1", "expected 0 or more, it is a reward"),
         ("task.gait.frequency=.nan", "got nan, expected a finite number"),
+        ("task.randomization.sensing_latency_s=[0, 0.04]", "expected from 0 to 0.02 s, a control step"),
+        ("task.gait.stance_ratio=0.2", "got 0.2, expected at least 0.35 and below 1"),
         ("task.randomization.motor_offset=[-.inf, 0]", "expected finite numbers"),
         ("task.randomization.motor_offset=[0, .nan]", "expected finite numbers"),
         ("num_envs=1000000000000", "expected at most 1e+06"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gymnasium
 import numpy as np
 import pytest
+import torch
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
@@ -105,3 +106,52 @@ def test_unknown_robots_and_several_in_one_are_refused():
         envs.gym.HumanoidVectorEnv(1, robots=["h2"])
     with pytest.raises(ConfigError, match="make_vec"):
         envs.gym.HumanoidGymEnv(robots=["h1", "g1"])
+
+
+def test_the_last_picture_of_an_episode_shows_where_it_ended(monkeypatch):
+    shown = []
+
+    class Recorder:
+        def __init__(self, *_):
+            pass
+
+        def show(self, poses):
+            shown.append(poses[0][2])
+
+        def frame(self):
+            return np.zeros((1, 1, 3), np.uint8)
+
+    monkeypatch.setattr(envs.gym, "OffscreenRenderer", Recorder)
+    monkeypatch.setattr(envs.gym, "Stage", lambda specs: None)
+    env = envs.gym.HumanoidGymEnv(robots=["t1"], render_mode="rgb_array")
+    env.reset(seed=0)
+    action = np.zeros(32, np.float32)
+    action[::2] = 1.0
+    while not env.step(action)[2]:
+        pass
+    env.render()
+    env.reset()
+    env.render()
+    assert shown[0] < shown[1] - 0.02, "it lay lower than it stands now"
+
+
+def test_steps_in_inference_mode_do_not_keep_it_from_being_reset():
+    env = make_vec(2, ["t1"])
+    with torch.inference_mode():
+        env.reset(seed=0)
+        env.step(np.zeros((2, 32), np.float32))
+    observation, _ = env.reset()
+    assert observation in env.observation_space
+
+
+def test_the_default_task_is_the_same_whenever_it_is_built_anew():
+    env = make_vec(1, ["t1"])
+    env.reset(seed=0)
+    task = env.unwrapped._sim.env
+    assert task.penalty_scale == 1.0
+    assert task.commands.sampler.weights.min() == 1.0, "all commands are open"
+
+
+def test_too_few_environments_are_refused_before_anything_is_built():
+    with pytest.raises(ConfigError, match="one for each of 2 robots"):
+        make_vec(1, ["h1", "g1"])

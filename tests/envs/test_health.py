@@ -42,10 +42,10 @@ def test_bad_numbers_are_caught_in_the_same_step_and_nobody_else_changes(where: 
         spoiled.step(actions(5, step))
     batch = spoiled.pool.batches[1]
     if where == "xfrc_applied":
-        batch._batch.bind(where)[0, 1, 2] = value
         for env in (healthy, spoiled):
             env.aids.harness[:] = 0.0  # which would overwrite it
             env._apply_aids()
+        batch._batch.bind(where)[0, 1, 2] = value
     elif where == "qacc_warmstart":
         if value == 1e12:
             return  # a poor first guess is no fault
@@ -177,7 +177,7 @@ def test_what_an_earlier_episode_did_is_not_mixed_in(tmp_path: Path) -> None:
             spoil(env, "qpos", np.nan)
         env.step(actions(5, step))
     lengths = [len(load_fault(path).time) for path in sorted(tmp_path.iterdir())]
-    assert lengths == [8, 3]
+    assert lengths == [8, 4], "as many as are kept, and three steps after where the second episode began"
 
 
 def test_fault_files_are_few(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from eagle_rl.config.schema import (
+    AidsCfg,
     CommandsCfg,
     ControlCfg,
     ObservationsCfg,
@@ -169,7 +170,10 @@ def test_what_was_handed_out_keeps_its_values() -> None:
     env.step(actions(5, 1))
     later = env.state
     root_pos = later.root_pos_w.clone()
+    observed = env.get_observations()
+    history = observed["history"].clone()
     env.reset()
+    assert torch.equal(observed["history"], history)
     assert torch.equal(later.root_pos_w, root_pos)
     assert_same(handed_out, copies[0], "observations")
     assert torch.equal(state.root_pos_w, copies[1])
@@ -358,3 +362,14 @@ def test_the_curriculum_goes_by_what_all_processes_saw() -> None:
     state = together.aids.state_dict()
     assert (state["_episode_ratio"] < alone.aids.state_dict()["_episode_ratio"]).all()
     assert not state["_contact_match"].any()
+
+
+def test_nothing_holds_the_bases_once_the_last_harness_is_gone() -> None:
+    env = make_env(num_envs=5, task=replace(TaskCfg(), aids=AidsCfg(harness=0.5)))
+    env.step(actions(5, 0))
+    held = [batch._batch.bind("xfrc_applied") for batch in env.pool.batches]
+    assert all(force.any() for force in held)
+    env.aids.harness[:] = 0.0
+    env._apply_aids()
+    env.step(actions(5, 1))
+    assert not any(force.any() for force in held)
