@@ -40,7 +40,7 @@ OPTIONS = {"num_envs": "--envs", "run.num_threads": "--threads"}
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="eagle bench",
-        description="Measure speed and memory. Both sides of a ratio are measured in turns (whole runs by `processes`), "
+        description="Measure speed and memory. Both sides of a ratio are measured in turns (`processes`: whole runs), "
         "so that other work on the machine slows both; still, leave it alone for numbers worth keeping.",
         usage="eagle bench [PART ...] [options]\n       eagle bench quality [key=value ...] [options]",
         epilog="Parts: " + "; ".join(f"{name}: {what}" for name, what in PARTS.items()) + ".",
