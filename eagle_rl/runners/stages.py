@@ -84,7 +84,7 @@ def run_experiment(
         worker.work(console or Console(stderr=True))
     except BaseException:
         for helper in helpers:
-            helper.terminate()  # a polite SIGTERM: it saves, then stops
+            helper.terminate()  # a polite SIGTERM, which adds nothing to a Ctrl-C: it saves, then stops
         raise
     finally:
         for helper in helpers:
