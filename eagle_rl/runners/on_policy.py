@@ -265,7 +265,7 @@ class EagleRunner(OnPolicyRunner):
                 "Undo the changes, or go on with --allow-drift, which marks the run."
             )
         self._load_state(checkpoint)
-        drifted = bool(changes) or checkpoint.manifest["drifted"]
+        drifted = self.provenance.drifted or bool(changes) or checkpoint.manifest["drifted"]
         self.provenance = dataclasses.replace(self.provenance, drifted=drifted)
 
     def load_weights(self, path: Path | str) -> None:

@@ -94,8 +94,8 @@ def train(job: Job) -> Path:
     elif job.init is not None:
         runner.load_weights(job.init)
     left = job.stage.iterations - runner.current_learning_iteration
-    runner.learn(left, on_iteration=lambda iteration: job.check_claim())
-    return checkpoints / f"model_{job.stage.iterations}.pt"
+    final = runner.learn(left, on_iteration=lambda iteration: job.check_claim())
+    return final or checkpoints / f"model_{job.stage.iterations}.pt"
 
 
 def _mirror(job: Job) -> MirrorMap:
