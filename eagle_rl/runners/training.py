@@ -154,6 +154,7 @@ def _average(job: Job) -> Path:
 def _make_runner(job: Job) -> EagleRunner:
     """The runner of a stage, its specialists loaded."""
     cfg, stage = job.cfg, job.stage
+    torch.manual_seed(stage.seed + job.rank)  # demonstrators draw their first step before the learner seeds its own
     simulation: VecEnv = job.make_env(stage.robots, cfg.num_envs, cfg.task, stage.seed + job.rank)
     env = simulation
     acting_base = _load(job.base, cfg.run.env_device)
