@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -77,6 +78,15 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+@dataclass(frozen=True)
+class _Trial:
+    """A policy to judge, and how."""
+
+    policy: Policy
+    protocol: EvaluationCfg
+    robots: tuple[str, ...]
+
+
 def _split(word: str) -> tuple[str | None, Path]:
     """``NAME=PATH`` or ``PATH``."""
     name, equals, path = word.partition("=")
@@ -104,7 +114,19 @@ def _protocol(ev: EvaluationCfg, args: argparse.Namespace) -> EvaluationCfg:
     return dataclasses.replace(ev, **{key: value for key, value in asked.items() if value is not None})
 
 
-def _judge(name: str, policy: Policy, ev: EvaluationCfg, robots: Sequence[str], console: Console) -> EvaluationResult:
+def _find(word: str, args: argparse.Namespace) -> tuple[str, EvaluationResult | _Trial]:
+    """The method a word of the command line names, and its stored result or the policy that is to be judged."""
+    from eagle_rl.evaluation.evaluate import EvaluationResult
+
+    name, path = _split(word)
+    if _is_result(path):
+        return name or path.stem, EvaluationResult.read(path)
+    policy = load_policy(path, args.device)
+    ev, robots = _protocol(policy.cfg.evaluation, args), chosen_robots(args.robots, policy.cfg)
+    return name or _method(policy.cfg), _Trial(policy, ev, robots)
+
+
+def _judge(name: str, trial: _Trial, console: Console) -> EvaluationResult:
     """Evaluate one policy, with progress."""
     from rich.progress import Progress
 
@@ -112,6 +134,7 @@ def _judge(name: str, policy: Policy, ev: EvaluationCfg, robots: Sequence[str], 
 
     from .environment import make_env_factory
 
+    policy, ev, robots = trial.policy, trial.protocol, trial.robots
     cfg = policy.cfg
     make_env = make_env_factory(cfg.run)
     with Progress(console=console, transient=True) as progress:
@@ -133,30 +156,27 @@ def main(argv: Sequence[str]) -> int:
 
     from rich.console import Console
 
-    from eagle_rl.evaluation.evaluate import EvaluationResult
     from eagle_rl.evaluation.metrics import SUBSETS
     from eagle_rl.evaluation.render import to_markdown
-    from eagle_rl.evaluation.report import tracking_table
+    from eagle_rl.evaluation.report import common_protocol, tracking_table
 
     if args.subset not in SUBSETS:
         raise ConfigError(f"--subset: got {args.subset!r}, expected one of {', '.join(SUBSETS)}.")
     if args.out is not None:
         require_folder(args.out)
     console = Console(stderr=True)
+    found = [_find(word, args) for word in args.checkpoints]
+    common_protocol(each.protocol for _, each in found)  # before anything is judged, which takes minutes
     results: dict[str, list[EvaluationResult]] = {}
-    for name, path in map(_split, args.checkpoints):
-        if _is_result(path):
-            method, result = name or path.stem, EvaluationResult.read(path)
-        else:
-            policy = load_policy(path, args.device)
-            method = name or _method(policy.cfg)
-            ev = _protocol(policy.cfg.evaluation, args)
-            result = _judge(method, policy, ev, chosen_robots(args.robots, policy.cfg), console)
+    for method, each in found:
+        result = _judge(method, each, console) if isinstance(each, _Trial) else each
         results.setdefault(method, []).append(result)
+        if args.out is not None:
+            _store(args.out, method, result)
     table = tracking_table(results, args.subset, args.falls)
     print(to_markdown(table))
     if args.out is not None:
-        _write(args.out, results, table)
+        _write(args.out, table)
     return 0
 
 
@@ -169,15 +189,17 @@ def _is_result(path: Path) -> bool:
     return not (path.name.startswith("model_") or path.with_suffix(SUFFIX).exists())
 
 
-def _write(folder: Path, results: Mapping[str, Sequence[EvaluationResult]], table: Table) -> None:
-    """Store results and table."""
+def _store(folder: Path, method: str, result: EvaluationResult) -> None:
+    """Keep a result, so that nothing that happens later costs it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / f"{_slug(method)}_seed{result.seed}_{result.checkpoint[:8]}.json"
+    file.write_text(result.to_json(), encoding="utf-8")
+
+
+def _write(folder: Path, table: Table) -> None:
+    """Write the table in every format."""
     from eagle_rl.evaluation.render import FORMATS
 
-    folder.mkdir(parents=True, exist_ok=True)
-    for method, runs in results.items():
-        for run in runs:
-            file = folder / f"{_slug(method)}_seed{run.seed}_{run.checkpoint[:8]}.json"
-            file.write_text(run.to_json(), encoding="utf-8")
     for suffix, write in FORMATS.items():
         (folder / f"table.{suffix}").write_text(write(table), encoding="utf-8")
 

@@ -60,10 +60,21 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _named(word: str) -> tuple[str, Path]:
-    """``NAME=PATH``, or a path that names itself."""
-    name, equals, path = word.partition("=")
-    return (name, Path(path)) if equals else (Path(word).stem, Path(word))
+def _named(words: Sequence[str]) -> dict[str, Path]:
+    """Paths by name: ``NAME=PATH``, or a path that names itself.
+
+    Raises:
+        ConfigError: two have one name, under which the second would be drawn over the first.
+    """
+    found: dict[str, Path] = {}
+    for word in words:
+        name, equals, rest = word.partition("=")
+        path = Path(rest if equals else word)
+        name = name if equals else path.stem
+        if name in found:
+            raise ConfigError(f"{found[name]} and {path}: both are named {name!r}. Name them apart: NAME=PATH.")
+        found[name] = path
+    return found
 
 
 def _curves(args: argparse.Namespace) -> dict[str, Figure]:
@@ -73,7 +84,7 @@ def _curves(args: argparse.Namespace) -> dict[str, Figure]:
     from eagle_rl.runners.records import read_plan, stage_dir
 
     figures = {}
-    for name, path in map(_named, args.paths):
+    for name, path in _named(args.paths).items():
         stages = (
             {s.name: stage_dir(path, s.name) for s in read_plan(path)} if (path / "plan.json").exists() else {"": path}
         )
@@ -96,7 +107,7 @@ def _rounds(args: argparse.Namespace) -> dict[str, Figure]:
     from eagle_rl.runners.records import read_plan
 
     figures = {}
-    for name, path in map(_named, args.paths):
+    for name, path in _named(args.paths).items():
         if path.suffix == ".csv":
             scores = rounds_from_csv(path)
         else:
@@ -109,7 +120,7 @@ def _rounds(args: argparse.Namespace) -> dict[str, Figure]:
 
 def _policies(args: argparse.Namespace) -> Iterator[tuple[str, Policy, tuple[str, ...]]]:
     """Name, policy and robots to show of each checkpoint."""
-    for name, path in map(_named, args.paths):
+    for name, path in _named(args.paths).items():
         policy = load_policy(path, args.device)
         yield name, policy, chosen_robots(args.robots, policy.cfg)
 

@@ -15,9 +15,7 @@ from eagle_rl.config.load import load_experiment, to_yaml
 from eagle_rl.config.schema import ExperimentCfg
 from eagle_rl.errors import CheckpointError, ConfigError
 from eagle_rl.paths import data_root
-from eagle_rl.runners.provenance import Provenance
-
-CONFIG = "config.yaml"
+from eagle_rl.runners.provenance import CONFIG, Provenance
 
 _README = """\
 {name}: {description}

@@ -50,8 +50,8 @@ class RoundScores:
     robot: str
     specialist: bool
     position: float
-    """Round of a generalist, 0 before the first; specialists stand half a round before the generalist they teach, once
-    searched a quarter."""
+    """Its stage's ``position`` among the rounds: a generalist at its round, 0 before the first; specialists, searched
+    and corrected ones the later, before the generalist they teach; an average after it."""
     errors: tuple[float, ...]
     """Charged errors in the order of the five commands."""
 

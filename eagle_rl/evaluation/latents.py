@@ -33,7 +33,7 @@ class Embeddings:
     robot: NDArray[np.int64]
     """Index into ``robots``, shape (M,)."""
     env: NDArray[np.int64]
-    """Environment each row comes from, unique over robots, shape (M,)."""
+    """Which of its robot's environments each row comes from, shape (M,)."""
 
 
 @torch.inference_mode()
@@ -77,7 +77,7 @@ def collect_embeddings(
                 ids = alive.nonzero().squeeze(1)
                 features.append(actor.embedding.cpu()[ids].numpy())
                 labels.append(np.full(len(ids), label))
-                sources.append(ids.numpy() + label * num_envs)
+                sources.append(ids.numpy())
     return Embeddings(
         robots=tuple(robots),
         features=np.concatenate(features),
@@ -102,9 +102,20 @@ def silhouette(embeddings: Embeddings) -> float:
 
 
 def probe_accuracy(embeddings: Embeddings) -> float:
-    """Share of samples whose robot a linear classifier names; trained on even environments, tested on odd ones."""
+    """Share of samples whose robot a linear classifier names; trained on even environments, tested on odd ones.
+
+    Raises:
+        ConfigError: a robot has samples for one of both alone.
+    """
     _require_several(embeddings)
     train = embeddings.env % 2 == 0
+    halves = (set(embeddings.robot[half].tolist()) for half in (train, ~train))
+    if one_sided := set.symmetric_difference(*halves):
+        names = ", ".join(embeddings.robots[i] for i in sorted(one_sided))
+        raise ConfigError(
+            "The probe of latents is trained on every second environment of a robot and tested on the others, but "
+            f"{names} walked in one half alone. Expected at least 2 environments a robot (--envs), more if robots fall."
+        )
     scaler = StandardScaler().fit(embeddings.features[train])
     probe = LogisticRegression(max_iter=1000).fit(scaler.transform(embeddings.features[train]), embeddings.robot[train])
     return float(probe.score(scaler.transform(embeddings.features[~train]), embeddings.robot[~train]))

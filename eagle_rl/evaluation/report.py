@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Literal
 
 from eagle_rl.config.schema import EvaluationCfg
@@ -97,12 +97,20 @@ def describe(ev: EvaluationCfg, subset: str, falls: Falls) -> str:
     )
 
 
-def _common_protocol(results: Iterable[EvaluationResult]) -> EvaluationCfg:
-    """The protocol all results share."""
-    protocols = {result.protocol for result in results}
-    if len(protocols) != 1:
-        raise ConfigError(f"A table needs results of one protocol, got {len(protocols)}: evaluate all methods alike.")
-    return protocols.pop()
+def common_protocol(protocols: Iterable[EvaluationCfg]) -> EvaluationCfg:
+    """The protocol all results share.
+
+    Raises:
+        ConfigError: they do not share one; names what differs.
+    """
+    first, *others = dict.fromkeys(protocols)
+    if others:
+        differs = [f.name for f in fields(first) if any(getattr(ev, f.name) != getattr(first, f.name) for ev in others)]
+        raise ConfigError(
+            f"A table needs results of one protocol, got {len(others) + 1}, which differ in {', '.join(differs)}: "
+            "evaluate all methods alike."
+        )
+    return first
 
 
 def tracking_table(
@@ -120,7 +128,7 @@ def tracking_table(
         paper: the paper's errors by method and robot; not shown for robots a method was not trained on, nor
             for upright or standing robots, which the paper does not judge by themselves.
     """
-    ev = _common_protocol(result for runs in results.values() for result in runs)
+    ev = common_protocol(result.protocol for runs in results.values() for result in runs)
     paper = paper if ev.protocol in ("single", "joint") else {}
     robots = list(dict.fromkeys(robot for runs in results.values() for result in runs for robot in result.robots))
     rows = []

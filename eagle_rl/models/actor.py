@@ -158,10 +158,6 @@ class EagleActor(MLPModel):
         """Exportable copy: (history, command, clock, slot_mask) -> (actions, estimate, embedding)."""
         return ExportedActor(copy.deepcopy(self))
 
-    def as_jit(self) -> nn.Module:
-        """Exportable copy: (history, command, clock, slot_mask) -> (actions, estimate, embedding)."""
-        return self.as_onnx()
-
     def _hidden(self, latent: Tensor) -> Tensor:
         """Activations (N, H) before the policy head's last layer."""
         return nn.Sequential(*list(self.mlp)[:-1])(latent)
@@ -175,7 +171,7 @@ class EagleActor(MLPModel):
 
 
 class ExportedActor(nn.Module):
-    """The deterministic policy of tensors, for ONNX and TorchScript."""
+    """The deterministic policy of tensors, for ONNX."""
 
     input_names = (*ACTOR_INPUTS, "slot_mask")
     output_names = ("actions", "estimate", "embedding")

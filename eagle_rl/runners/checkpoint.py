@@ -172,11 +172,19 @@ def publish_policy(path: Path, target: Path, env_steps: int | None = None) -> Pa
 
     Args:
         path: the checkpoint.
-        target: where to, without suffix.
+        target: where to; its whole name is kept, dots and all.
         env_steps: what the policy has cost, if that is more than its own stage.
+
+    Raises:
+        CheckpointError: ``path`` is damaged, or published already.
     """
+    if path.suffix == published.SUFFIX:
+        raise CheckpointError(
+            f"{path}: published already, expected a checkpoint. Copy it and what lies beside it under its name, or "
+            "publish the checkpoint it was made from."
+        )
     checkpoint = load_checkpoint(path)
-    target = target.with_suffix(published.SUFFIX)
+    target = target.with_name(target.name.removesuffix(published.SUFFIX) + published.SUFFIX)
     correction = {f"{_CORRECTION}{name}": x for name, x in checkpoint.state.get("correction", {}).items()}
     weights = checkpoint.state["algorithm"]["actor_state_dict"] | correction
     manifest = checkpoint.manifest | ({} if env_steps is None else {"env_steps": env_steps})

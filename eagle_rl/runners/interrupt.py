@@ -9,7 +9,11 @@ from typing import Any
 
 
 class InterruptGuard:
-    """While active, the first SIGINT or SIGTERM only sets ``requested``; the second leaves at once."""
+    """While active, SIGINT and SIGTERM only set ``requested``; a SIGINT after that leaves at once.
+
+    A SIGTERM never does: of one wish to stop, a helper hears from the terminal or a supervisor, and from its main
+    process, too.
+    """
 
     def __init__(self) -> None:
         """Start without a request."""
@@ -31,6 +35,6 @@ class InterruptGuard:
             signal.signal(number, handler)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        if self.requested:
+        if self.requested and number == signal.SIGINT:
             raise KeyboardInterrupt
         self.requested = True

@@ -8,16 +8,15 @@ import io
 import os
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from rsl_rl.env import VecEnv
 from rsl_rl.runners import OnPolicyRunner
 
 from eagle_rl.algorithms.eagle_ppo import EaglePPO
-from eagle_rl.algorithms.specialists import SpecialistBank
 from eagle_rl.config.schema import AlgoCfg, RunCfg
 from eagle_rl.errors import CheckpointError, EagleWarning, HealthError, Interrupted
 from eagle_rl.models import EagleActor
@@ -201,10 +200,6 @@ class EagleRunner(OnPolicyRunner):
         self.logger.add_step(rewards, dones, extras)
         stopwatch.lap("logging")
 
-    def imitate(self, specialists: Sequence[EagleActor], method: Literal["eagle", "kickstart"]) -> None:
-        """Learn from one specialist per robot, in the order of the environment's robots, too."""
-        self.alg.imitate(SpecialistBank([actor.to(self.device) for actor in specialists]), method)
-
     # --- checkpoints ------------------------------------------------------------------------------------------------
 
     def save(self, stage_end: bool = False) -> Path | None:
@@ -265,7 +260,7 @@ class EagleRunner(OnPolicyRunner):
                 "Undo the changes, or go on with --allow-drift, which marks the run."
             )
         self._load_state(checkpoint)
-        drifted = bool(changes) or checkpoint.manifest["drifted"]
+        drifted = self.provenance.drifted or bool(changes) or checkpoint.manifest["drifted"]
         self.provenance = dataclasses.replace(self.provenance, drifted=drifted)
 
     def load_weights(self, path: Path | str) -> None:

@@ -13,6 +13,9 @@ from functools import cache
 from importlib import metadata
 from typing import Any
 
+CONFIG = "config.yaml"
+"""File in a run's folder with every value of its experiment: for readers, and for ``--resume``."""
+
 _DISTRIBUTIONS = ("torch", "rsl-rl-lib", "tensordict", "mujoco", "pin", "numpy")
 
 
@@ -58,7 +61,7 @@ class Provenance:
     """Robot name to the hash of its files, in the order of the environment."""
     slot_table_hash: str = ""
     stage: str = "train"
-    """Path of the stage in its run, e.g. ``round_0/specialist/h1``."""
+    """Path of the stage in its run, e.g. ``round1/specialist_h1``."""
     parents: Sequence[str] = ()
     """Sha256 of the checkpoints this stage started from or learns from."""
     drifted: bool = False

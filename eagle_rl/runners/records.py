@@ -13,11 +13,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from eagle_rl.config.yaml_file import write_yaml
 from eagle_rl.errors import CheckpointError, ConfigError
 from eagle_rl.runners.checkpoint import verify_checkpoint
 from eagle_rl.runners.files import write_atomically
 from eagle_rl.runners.plan import Stage
-from eagle_rl.runners.provenance import Provenance
+from eagle_rl.runners.provenance import CONFIG, Provenance
 
 State = Literal["pending", "training", "judging", "done"]
 
@@ -72,8 +73,10 @@ def final_checkpoint(run_dir: Path, stage: str) -> Path:
 
 def open_plan(
     run_dir: Path, provenance: Provenance, stages: Sequence[Stage], *, resume: bool, allow_drift: bool = False
-) -> None:
+) -> Provenance:
     """Write the plan of a new run, or check that a resumed run is the one that was begun.
+
+    A run that has drifted takes its new values over, so that it is resumed with them from then on.
 
     Args:
         run_dir: the run's folder.
@@ -81,20 +84,28 @@ def open_plan(
         stages: the planned stages.
         resume: whether the folder is expected to hold this run already.
         allow_drift: go on although something has changed.
+
+    Returns:
+        The provenance, marked if the run has ever drifted.
     """
     path = run_dir / "plan.json"
     if path.exists() or resume:
         if not resume:
             raise ConfigError(f"{run_dir}: holds a run already. Continue it with --resume, or choose another --out.")
         with _damage_in_words(path):
-            changes = provenance.differences(_read_plan_file(run_dir)["provenance"])
+            begun = _read_plan_file(run_dir)["provenance"]
+            changes = provenance.differences(begun)
+            provenance = dataclasses.replace(provenance, drifted=begun["drifted"] or bool(changes))
         if changes and not allow_drift:
             raise ConfigError([f"{run_dir}: changed since the run was begun; undo it or use --allow-drift.", *changes])
         if not changes:
-            return
+            return provenance
+        values = provenance.as_manifest()["config"]  # before the plan, against which a resumed run is checked
+        write_atomically(run_dir / CONFIG, write_yaml(values).encode())
     run_dir.mkdir(parents=True, exist_ok=True)
     plan = {"provenance": provenance.as_manifest(), "stages": [dataclasses.asdict(stage) for stage in stages]}
     write_atomically(path, json.dumps(plan, indent=1).encode())
+    return provenance
 
 
 @contextlib.contextmanager

@@ -56,7 +56,7 @@ def take_root(
     """
     source = find_checkpoint(Path(cfg.plan.root or ""))
     if source.suffix == SUFFIX:
-        raise CheckpointError(f"plan.root: {source}: a published policy has no critic to go on from; use a checkpoint.")
+        raise _no_critic(source, "a published policy")
     manifest = verify_checkpoint(source)
     require_whole(source, manifest)
     if load_correction(source) is not None:
@@ -66,6 +66,8 @@ def take_root(
         )
     was = experiment_from_plain(manifest["config"], str(source)).task
     state = load_checkpoint(source).state
+    if "critic_state_dict" not in state["algorithm"]:
+        raise _no_critic(source, "a specialist that was given to its run")
     symmetric, was_symmetric = cfg.algo.network.symmetric, bool(state.get("architecture", {}).get("mirror"))
     if first:
         tell_changed_meaning(
@@ -84,6 +86,12 @@ def take_root(
         path = source.with_suffix(suffix)
         write_atomically(checkpoints / path.name, path.read_bytes())
     return checkpoints / source.name
+
+
+def _no_critic(source: Path, what: str) -> CheckpointError:
+    """Why nothing but a policy is no root."""
+    words = "has no critic to go on from; use a checkpoint of a stage that was trained."
+    return CheckpointError(f"plan.root: {source}: {what} {words}")
 
 
 def _sides(mirror: MirrorMap) -> dict[str, Any]:

@@ -69,12 +69,13 @@ def run_experiment(
     team = team or Team(cfg.run.device)
     if jobs > 1 and team.size > 1:
         raise ConfigError(f"--jobs {jobs}: each of {team.size} data-parallel processes trains the same stage; use one.")
-    provenance = dataclasses.replace(provenance or Provenance(), config=dataclasses.asdict(cfg))
+    now = dataclasses.replace(provenance or Provenance(), config=dataclasses.asdict(cfg))
     stages = plan_stages(cfg, team.size)
     for stage in stages:
         if stage.source and not resume:  # before anything is trained
-            open_teacher(cfg, stage, provenance.slot_table_hash)
-    team.agree(lambda: open_plan(run_dir, provenance, stages, resume=resume, allow_drift=allow_drift))
+            open_teacher(cfg, stage, now.slot_table_hash)
+    provenance = team.agree(lambda: open_plan(run_dir, now, stages, resume=resume, allow_drift=allow_drift))
+    allow_drift |= provenance.drifted  # its checkpoints may be from before
     worker = Worker(cfg, stages, run_dir, make_env, provenance, team, allow_drift, jobs)
     spawn = multiprocessing.get_context("spawn")
     helpers = [spawn.Process(target=_help, args=(worker,)) for _ in range(jobs - 1)]
@@ -84,7 +85,7 @@ def run_experiment(
         worker.work(console or Console(stderr=True))
     except BaseException:
         for helper in helpers:
-            helper.terminate()  # a polite SIGTERM: it saves, then stops
+            helper.terminate()  # a polite SIGTERM, which adds nothing to a Ctrl-C: it saves, then stops
         raise
     finally:
         for helper in helpers:

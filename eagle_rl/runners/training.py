@@ -94,8 +94,8 @@ def train(job: Job) -> Path:
     elif job.init is not None:
         runner.load_weights(job.init)
     left = job.stage.iterations - runner.current_learning_iteration
-    runner.learn(left, on_iteration=lambda iteration: job.check_claim())
-    return checkpoints / f"model_{job.stage.iterations}.pt"
+    final = runner.learn(left, on_iteration=lambda iteration: job.check_claim())
+    return final or checkpoints / f"model_{job.stage.iterations}.pt"
 
 
 def _mirror(job: Job) -> MirrorMap:
@@ -154,6 +154,7 @@ def _average(job: Job) -> Path:
 def _make_runner(job: Job) -> EagleRunner:
     """The runner of a stage, its specialists loaded."""
     cfg, stage = job.cfg, job.stage
+    torch.manual_seed(stage.seed + job.rank)  # demonstrators draw their first step before the learner seeds its own
     simulation: VecEnv = job.make_env(stage.robots, cfg.num_envs, cfg.task, stage.seed + job.rank)
     env = simulation
     acting_base = _load(job.base, cfg.run.env_device)

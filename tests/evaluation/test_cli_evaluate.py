@@ -8,11 +8,13 @@ import json
 import pytest
 import torch
 
+from eagle_rl.cli import evaluate
 from eagle_rl.cli.environment import make_env_factory
 from eagle_rl.cli.evaluate import main
 from eagle_rl.cli.export import main as export
 from eagle_rl.cli.policy import load_policy
 from eagle_rl.config.load import load_experiment
+from eagle_rl.config.schema import EvaluationCfg
 from eagle_rl.errors import ConfigError
 from eagle_rl.evaluation.evaluate import EvaluationResult
 from eagle_rl.models.correction import CorrectedPolicy
@@ -20,6 +22,9 @@ from eagle_rl.runners.provenance import Provenance, slot_table_hash
 from eagle_rl.runners.records import final_checkpoint
 from eagle_rl.runners.stages import run_experiment
 from envs.robots.slots import SLOT_NAMES
+from tests.evaluation.test_report import result
+from tests.policy import untrained_checkpoint
+from tests.runners.toy_run import refuse
 
 QUICK = ["--envs", "2", "--steps", "10"]
 
@@ -106,6 +111,29 @@ def test_a_policy_can_be_judged_on_robots_it_has_never_seen(run, capsys):
     out = capsys.readouterr().out
     assert "| g1 | PPO (unseen) |" in out
     assert "| h1 |" not in out
+
+
+def test_protocols_are_compared_before_anything_is_judged(tmp_path, monkeypatch):
+    stored = tmp_path / "old.json"
+    stored.write_text(result((0.1,) * 5).to_json())
+    monkeypatch.setattr(evaluate, "_judge", refuse)
+    with pytest.raises(ConfigError, match="one protocol"):
+        main([f"NEW={untrained_checkpoint(tmp_path, 't1')}", f"OLD={stored}", "--out", str(tmp_path / "out")])
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_has_been_judged_is_kept_whatever_comes_next(tmp_path, monkeypatch):
+    def judge(method, trial, console):
+        if method == "B":
+            raise KeyboardInterrupt
+        return result((0.1,) * 5, ev=trial.protocol)
+
+    monkeypatch.setattr(evaluate, "_judge", judge)
+    path = untrained_checkpoint(tmp_path, "t1")
+    with pytest.raises(KeyboardInterrupt):
+        main([f"A={path}", f"B={path}", "--out", str(tmp_path / "out")])
+    (kept,) = (tmp_path / "out").iterdir()
+    assert EvaluationResult.read(kept) == result((0.1,) * 5, ev=EvaluationCfg())
 
 
 def test_an_unknown_subset_is_refused(run):

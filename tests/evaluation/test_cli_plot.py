@@ -52,6 +52,13 @@ def test_rounds_are_drawn_in_one_figure(run, tmp_path):
     assert (again / stored.name).read_text() == stored.read_text()
 
 
+@pytest.mark.parametrize("figure", ["curves", "rounds", "latents"])
+def test_two_paths_of_one_name_are_refused(tmp_path, figure):
+    same = [f"{run}/stages/generalist" for run in "AB"]
+    with pytest.raises(ConfigError, match=r"both are named 'generalist'.*NAME=PATH"):
+        main([figure, *same, "--out", str(tmp_path)])
+
+
 def test_a_folder_that_is_no_run_is_refused(tmp_path):
     with pytest.raises(ConfigError, match="no such file"):
         main(["curves", str(tmp_path)])

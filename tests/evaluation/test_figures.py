@@ -78,8 +78,17 @@ def test_embeddings_are_those_of_robots_still_walking_forward():
         stride=4,
     )
     assert found.robot.tolist() == [0, 0, 0, 0, 0, 1, 1, 1, 1, 1]
-    assert found.env.tolist() == [0, 1, 2, 1, 2, 3, 4, 5, 4, 5]
+    assert found.env.tolist() == [0, 1, 2, 1, 2] * 2
     np.testing.assert_allclose(found.features[:, :5], np.tile(latents.WALK_FORWARD, (10, 1)), rtol=1e-6)
+
+
+@pytest.mark.parametrize("env", [[0, 1, 0, 0], [0, 0, 0, 0]])
+def test_a_robot_that_walked_in_one_half_of_its_environments_alone_is_named(env):
+    """The probe would not know it, or never be asked for it."""
+    robot, features = np.array([0, 0, 1, 1]), np.eye(4, dtype=np.float32)
+    few = Embeddings(robots=("a", "b"), features=features, robot=robot, env=np.array(env))
+    with pytest.raises(ConfigError, match=r"b walked in one half alone.*at least 2 environments"):
+        latents.probe_accuracy(few)
 
 
 def test_the_script_visits_both_limits_of_every_command():

@@ -90,7 +90,7 @@ def test_every_robot_has_the_floor_rows():
 
 def test_results_of_different_protocols_are_refused():
     other = EvaluationCfg(num_envs_per_robot=17)
-    with pytest.raises(ConfigError, match="one protocol"):
+    with pytest.raises(ConfigError, match="one protocol, got 2, which differ in num_envs_per_robot, num_steps:"):
         tracking_table({"PPO": [result((0.1,) * 5)], "EAGLE": [result((0.1,) * 5, ev=other)]})
 
 

@@ -275,6 +275,20 @@ def test_a_published_policy_is_the_checkpoint_s_and_any_flipped_byte_is_refused(
             ckpt.load_actor(path)
 
 
+def test_the_whole_name_of_a_published_policy_is_kept(tmp_path):
+    checkpoint = make_runner(tmp_path, provenance=PROVENANCE).learn(1)
+    for name in ("v1.2", "v1.3.safetensors"):
+        ckpt.publish_policy(checkpoint, tmp_path / "weights" / name)
+    expected = {f"v1.{minor}{suffix}" for minor in (2, 3) for suffix in (".safetensors", ".json")}
+    assert {path.name for path in (tmp_path / "weights").iterdir()} == expected
+
+
+def test_what_is_published_already_is_not_published_again(tmp_path):
+    path = ckpt.publish_policy(make_runner(tmp_path, provenance=PROVENANCE).learn(1), tmp_path / "old")
+    with pytest.raises(CheckpointError, match="published already, expected a checkpoint"):
+        ckpt.publish_policy(path, tmp_path / "new")
+
+
 @pytest.mark.parametrize("hidden", [[10**9], [-1, -5], "many", [[1]]])
 def test_an_absurd_architecture_is_refused_without_claiming_memory(tmp_path, hidden):
     runner = make_runner(tmp_path)

@@ -31,7 +31,7 @@ def shaken(actor: EagleActor, seed: int, scale: float = 0.1) -> EagleActor:
 
 def with_specialists(runner: EagleRunner, method: str = "eagle") -> list[EagleActor]:
     bank = [shaken(runner.alg.actor, seed) for seed in range(3)]
-    runner.imitate(bank, method)
+    runner.alg.imitate(SpecialistBank(bank), method)
     return bank
 
 
@@ -308,7 +308,7 @@ def test_distillation_brings_actions_and_embeddings_of_every_robot_to_its_specia
     rates = {"learning_rate": 3e-3, "learning_rate_range": (3e-3, 3e-3)}
     runner = make_runner(action_loss_coef=20.0, estimation_coef=0.5, use_ppo_loss=use_ppo_loss, **rates)
     bank = [shaken(runner.alg.actor, 0)] * 3
-    runner.imitate(bank, "eagle")
+    runner.alg.imitate(SpecialistBank(bank), "eagle")
     collect(runner)
     states = runner.alg.storage.observations.flatten(0, 1).clone()
     before = distances(runner.alg.actor, bank, states)

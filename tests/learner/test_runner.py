@@ -12,6 +12,7 @@ import pytest
 import torch
 from rich.console import Console
 
+from eagle_rl.algorithms.specialists import SpecialistBank
 from eagle_rl.algorithms.stopwatch import SECTIONS
 from eagle_rl.errors import CheckpointError
 from eagle_rl.runners import checkpoint as ckpt
@@ -120,7 +121,7 @@ def test_a_resumed_distillation_equals_the_uninterrupted_one(tmp_path):
         r = make_runner(tmp_path / name)
         actor = make_runner(seed=5).alg.actor
         torch.manual_seed(1)
-        r.imitate([shaken(actor, seed) for seed in range(3)], "kickstart")
+        r.alg.imitate(SpecialistBank([shaken(actor, seed) for seed in range(3)]), "kickstart")
         return r
 
     whole, cut = runner("whole"), runner("cut")

@@ -13,6 +13,7 @@ from torch import Tensor, fx
 from eagle_rl import kernels
 from eagle_rl.algorithms import sharing
 from eagle_rl.algorithms.sharing import MIN_WORK
+from eagle_rl.algorithms.specialists import SpecialistBank
 from eagle_rl.errors import EagleWarning
 from eagle_rl.runners.on_policy import EagleRunner
 from eagle_rl.threads import use_threads
@@ -60,7 +61,7 @@ def require_alike(found: dict[str, Tensor], expected: dict[str, Tensor], toleran
 
 def imitating(runner: EagleRunner, method: str | None) -> EagleRunner:
     if method is not None:
-        runner.imitate([copy.deepcopy(runner.alg.actor) for _ in range(3)], method)
+        runner.alg.imitate(SpecialistBank([copy.deepcopy(runner.alg.actor) for _ in range(3)]), method)
     return runner
 
 

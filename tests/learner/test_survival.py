@@ -17,14 +17,19 @@ from tests.learner.helpers import make_runner
 from tests.learner.test_runner import assert_same
 from tests.toy import ToyEnv
 
+BOTH = (signal.SIGINT, signal.SIGTERM)
+"""What a helper of ``--jobs`` gets: a Ctrl-C as the terminal's other processes do, then what its main process sends."""
+TWICE = (signal.SIGTERM, signal.SIGTERM)
+"""The same where a supervisor stops all processes of a run."""
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupted_run_finishes_its_iteration_saves_and_goes_on_unchanged(tmp_path, number):
+
+@pytest.mark.parametrize("numbers", [(signal.SIGINT,), (signal.SIGTERM,), BOTH, TWICE])
+def test_an_interrupted_run_finishes_its_iteration_saves_and_goes_on_unchanged(tmp_path, numbers):
     whole = make_runner()
     whole.learn(4)
     runner = make_runner(tmp_path)
     with pytest.raises(Interrupted, match="after iteration 2") as caught:
-        runner.learn(4, on_iteration=lambda i: signal.raise_signal(number) if i == 2 else None)
+        runner.learn(4, on_iteration=lambda i: [signal.raise_signal(n) for n in numbers] if i == 2 else None)
     assert caught.value.exit_code == 130
     resumed = make_runner(tmp_path)
     resumed.load(ckpt.latest_checkpoint(tmp_path / "checkpoints"))
@@ -33,10 +38,11 @@ def test_an_interrupted_run_finishes_its_iteration_saves_and_goes_on_unchanged(t
     assert_same(whole, resumed)
 
 
-def test_a_second_signal_leaves_at_once_with_the_last_checkpoint_intact(tmp_path):
+@pytest.mark.parametrize("first", [signal.SIGINT, signal.SIGTERM])
+def test_a_second_ctrl_c_leaves_at_once_with_the_last_checkpoint_intact(tmp_path, first):
     def twice(iteration: int) -> None:
         if iteration == 3:
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(first)
             signal.raise_signal(signal.SIGINT)
 
     handler = signal.getsignal(signal.SIGINT)

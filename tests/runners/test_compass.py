@@ -10,7 +10,7 @@ import torch
 from eagle_rl.algorithms.specialists import SpecialistBank
 from eagle_rl.cli.policy import load_policy
 from eagle_rl.errors import CheckpointError
-from eagle_rl.runners.checkpoint import load_actor
+from eagle_rl.runners.checkpoint import load_actor, load_checkpoint
 from eagle_rl.runners.compass import (
     DemonstrationEnv,
     ResidualBank,
@@ -19,11 +19,14 @@ from eagle_rl.runners.compass import (
     begin_residual,
     mean_actions,
 )
+from eagle_rl.runners.plan import plan_stages
 from eagle_rl.runners.provenance import Provenance, slot_table_hash
 from eagle_rl.runners.records import stage_dir
 from eagle_rl.runners.stages import run_experiment
+from eagle_rl.runners.training import stage_cfg, train
 from envs.robots.slots import SLOT_NAMES
-from tests.runners.toy_run import make_toy_env, toy_experiment
+from tests.learner.test_runner import compare
+from tests.runners.toy_run import make_toy_env, toy_experiment, toy_job
 from tests.toy import NUM_SLOTS
 
 ROBOTS = ("one", "two", "three")
@@ -90,6 +93,20 @@ def test_demonstrations_are_the_teachers_whatever_the_policy_does(actors):
         env = DemonstrationEnv(make_env(), SpecialistBank([actors[0]] * 3), NUM_SLOTS)
         shown.append([env.step(actions)[0] for _ in range(20)])
     assert all((a == b).all() for a, b in zip(*shown, strict=True))
+
+
+def test_a_demonstration_begins_the_same_whatever_its_process_did_before(run, tmp_path):
+    cfg = toy_experiment(iterations=1, method="compass")
+    stage = next(stage for stage in plan_stages(cfg) if stage.name == "compass/base")
+    demonstrator = run.run_dir / run.records["generalist"].checkpoint
+    ends = []
+    for before in (0, 1):
+        torch.manual_seed(before)
+        job = toy_job(stage_cfg(cfg, stage), stage, tmp_path / str(before))
+        ends.append(load_checkpoint(train(replace(job, teachers=(demonstrator,) * 3))).state)
+    for end in ends:
+        end["runner"].pop("wall_time")
+    compare(*ends, "state")
 
 
 def test_the_target_of_the_world_model_is_the_frame_that_follows(actors):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -9,9 +10,10 @@ from pathlib import Path
 import pytest
 import torch
 
+from eagle_rl.config.load import to_yaml
 from eagle_rl.errors import CheckpointError, ConfigError, EagleWarning
 from eagle_rl.evaluation.evaluate import EvaluationResult
-from eagle_rl.runners.checkpoint import load_actor, load_checkpoint
+from eagle_rl.runners.checkpoint import load_actor, load_checkpoint, read_manifest
 from eagle_rl.runners.claims import Claim, ClaimLostError
 from eagle_rl.runners.plan import plan_stages
 from eagle_rl.runners.records import final_checkpoint, read_record, stage_dir
@@ -94,6 +96,46 @@ def test_a_folder_without_a_plan_cannot_be_resumed(tmp_path):
 def test_resume_with_another_configuration_lists_what_changed(finished):
     with pytest.raises(ConfigError, match=r"plan\.distill_env_steps: 144 -> 7"):
         run_experiment(toy_experiment(distill_env_steps=7), finished.run_dir, make_toy_env, resume=True)
+
+
+def cut_after(steps):
+    """Environments whose process is interrupted, without time to save, after so many control steps."""
+
+    class Cut(JudgedToyEnv):
+        left = steps
+
+        def step(self, actions):
+            self.left -= 1
+            if self.left < 0:
+                raise KeyboardInterrupt
+            return super().step(actions)
+
+    return lambda robots, num_envs, task, seed, first=0: Cut(num_envs, tuple(robots), seed)
+
+
+def test_a_run_that_drifted_goes_on_with_its_new_values_and_all_of_it_is_marked(tmp_path):
+    old = toy_experiment(iterations=2, judge_envs=0)
+    new = replace(old, algo=replace(old.algo, gamma=0.9))
+    with pytest.raises(KeyboardInterrupt):
+        run_experiment(old, tmp_path, cut_after(STEPS))
+    with pytest.raises(KeyboardInterrupt):
+        run_experiment(new, tmp_path, cut_after(0), resume=True, allow_drift=True)
+    assert (tmp_path / "config.yaml").read_text() == to_yaml(new), "what --resume reads"
+    result = run_experiment(new, tmp_path, make_toy_env, resume=True)
+    assert json.loads((tmp_path / "plan.json").read_text())["provenance"]["drifted"]
+    for name in result.records:
+        assert read_manifest(final_checkpoint(tmp_path, name))["drifted"], name
+    with pytest.raises(ConfigError, match=r"gamma: 0\.9 -> 0\.99"):
+        run_experiment(old, tmp_path, make_toy_env, resume=True)
+
+
+def test_a_drift_to_a_budget_already_passed_ends_the_stage_with_what_there_is(tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        run_experiment(toy_experiment(iterations=3, judge_envs=0, method="ppo"), tmp_path, cut_after(2 * STEPS))
+    less = toy_experiment(iterations=1, judge_envs=0, method="ppo")
+    result = run_experiment(less, tmp_path, make_toy_env, resume=True, allow_drift=True)
+    assert result.generalist.name == "model_2.pt"
+    assert result.env_steps == 2 * ENVS * STEPS
 
 
 def test_two_workers_reach_the_same_parameters_as_one(finished, tmp_path):

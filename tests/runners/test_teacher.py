@@ -85,6 +85,15 @@ def test_who_cannot_teach_here_is_refused_in_words(specialists, tmp_path, robot,
         train(job)
 
 
+def test_a_given_specialist_is_no_root(specialists, tmp_path):
+    cfg = taught_by(final_checkpoint(specialists, "generalist"), "generalist", "generalist")
+    stage = next(stage for stage in plan_stages(cfg) if stage.kind == "teacher")
+    given = train(toy_job(replace(cfg, robots=("one",)), stage, tmp_path / "stage", make_still_env))
+    forked = toy_experiment(method="ppo", root=str(given))
+    with pytest.raises(CheckpointError, match="a specialist that was given to its run has no critic to go on from"):
+        train(toy_job(forked, plan_stages(forked)[0], tmp_path / "root", refuse))
+
+
 def test_another_width_of_embedding_is_refused(specialists, tmp_path):
     cfg = taught_by(corrected(specialists, "one"), "generalist", "generalist")
     cfg = replace(cfg, algo=replace(cfg.algo, network=replace(cfg.algo.network, embedding_dim=9)))
