@@ -54,6 +54,8 @@ class Job:
     """Checkpoint whose weights those of ``init`` are averaged with."""
     base: Path | None
     """Checkpoint of the policy whose actions the specialists' are added to."""
+    critic: Path | None
+    """Checkpoint whose critic and learning rate a residual begins with."""
     make_env: MakeEnv
     provenance: Provenance
     check_claim: Callable[[], None]
@@ -173,9 +175,11 @@ def _make_runner(job: Job) -> EagleRunner:
     if bank is not None and stage.imitation is not None:
         runner.alg.imitate(bank, stage.imitation)
         runner.alg.imitation_updates = stage.iterations
-    if job.base is not None and base is not None and stage.kind == "residual":
+    if base is not None and job.critic is not None:
         begin_residual(runner.alg.actor, base)
-        runner.alg.adopt(load_checkpoint(job.base).state["algorithm"])
+        learner = load_checkpoint(job.critic)
+        runner.require_same_shapes(learner, ("critic",))
+        runner.alg.adopt(learner.state["algorithm"])
     return runner
 
 

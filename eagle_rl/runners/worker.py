@@ -112,6 +112,7 @@ class Worker:
             teachers=tuple(inputs[name] for name in stage.teachers),
             start=None if stage.start is None else inputs[stage.start],
             base=None if stage.base is None else inputs[stage.base],
+            critic=None if stage.critic is None else inputs[stage.critic],
             make_env=self.make_env,
             provenance=provenance,
             check_claim=check_claim,
