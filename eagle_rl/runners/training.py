@@ -66,11 +66,13 @@ class Job:
 
 
 def stage_cfg(cfg: ExperimentCfg, stage: Stage) -> ExperimentCfg:
-    """The experiment as one stage sees it: its robots and its task."""
+    """The experiment as one stage sees it: its robots, its task and, where nothing is imitated, PPO's loss."""
     task = warm_task(cfg.task) if stage.warm else cfg.task
     algo = cfg.algo
     if stage.demonstrations:
         algo = dataclasses.replace(algo, use_ppo_loss=False, kickstart_coef=1.0, kickstart_decay=0.0)
+    elif stage.imitation is None:
+        algo = dataclasses.replace(algo, use_ppo_loss=True)
     return dataclasses.replace(cfg, robots=stage.robots, num_envs=stage_num_envs(cfg, stage.kind), task=task, algo=algo)
 
 
