@@ -123,7 +123,7 @@ def _judge(name: str, policy: Policy, ev: EvaluationCfg, robots: Sequence[str], 
         robots=scores,
         seed=cfg.seed,
         env_steps=policy.env_steps,
-        unseen=tuple(robot for robot in robots if robot not in cfg.robots),
+        unseen=tuple(robot for robot in robots if not policy.knows(robot)),
     )
 
 

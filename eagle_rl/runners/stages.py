@@ -73,7 +73,7 @@ def run_experiment(
     stages = plan_stages(cfg, team.size)
     for stage in stages:
         if stage.source and not resume:  # before anything is trained
-            open_teacher(cfg, stage, provenance.slot_table_hash)
+            open_teacher(cfg, stage, provenance)
     team.agree(lambda: open_plan(run_dir, provenance, stages, resume=resume, allow_drift=allow_drift))
     worker = Worker(cfg, stages, run_dir, make_env, provenance, team, allow_drift, jobs)
     spawn = multiprocessing.get_context("spawn")

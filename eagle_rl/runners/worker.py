@@ -100,7 +100,7 @@ class Worker:
         provenance = dataclasses.replace(
             self.provenance,
             config=dataclasses.asdict(cfg),
-            robots={name: self.provenance.robots.get(name, "") for name in stage.robots},
+            robots={name: self.provenance.robots.get(name, "") for name in map(self.provenance.name_of, stage.robots)},
             stage=stage.name,
             parents=tuple(read_manifest(path)["sha256"] for path in inputs.values()),
         )

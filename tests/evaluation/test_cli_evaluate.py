@@ -16,6 +16,7 @@ from eagle_rl.config.load import load_experiment
 from eagle_rl.errors import ConfigError
 from eagle_rl.evaluation.evaluate import EvaluationResult
 from eagle_rl.models.correction import CorrectedPolicy
+from eagle_rl.paths import data_root
 from eagle_rl.runners.provenance import Provenance, slot_table_hash
 from eagle_rl.runners.records import final_checkpoint
 from eagle_rl.runners.stages import run_experiment
@@ -106,6 +107,11 @@ def test_a_policy_can_be_judged_on_robots_it_has_never_seen(run, capsys):
     out = capsys.readouterr().out
     assert "| g1 | PPO (unseen) |" in out
     assert "| h1 |" not in out
+
+
+def test_a_robot_is_known_by_the_name_in_its_file_however_it_is_given(run, capsys):
+    assert main([f"PPO={run.run_dir}", *QUICK, "--robots", str(data_root() / "cfg/robots/h1.yaml")]) == 0
+    assert "(unseen)" not in capsys.readouterr().out
 
 
 def test_an_unknown_subset_is_refused(run):
