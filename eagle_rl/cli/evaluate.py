@@ -109,6 +109,7 @@ def _judge(name: str, policy: Policy, ev: EvaluationCfg, robots: Sequence[str], 
     from rich.progress import Progress
 
     from eagle_rl.evaluation.evaluate import EvaluationResult, evaluate
+    from eagle_rl.evaluation.protocol import finishing_ranges
 
     from .environment import make_env_factory
 
@@ -124,6 +125,7 @@ def _judge(name: str, policy: Policy, ev: EvaluationCfg, robots: Sequence[str], 
         seed=cfg.seed,
         env_steps=policy.env_steps,
         unseen=tuple(robot for robot in robots if not policy.knows(robot)),
+        ranges=finishing_ranges(cfg.task.commands),
     )
 
 

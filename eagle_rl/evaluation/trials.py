@@ -12,7 +12,13 @@ from torch import Tensor
 
 from eagle_rl.config.schema import EvaluationCfg, ExperimentCfg, TaskCfg
 from eagle_rl.evaluation.evaluate import MakeEnv
-from eagle_rl.evaluation.protocol import COMMANDS, NUM_VELOCITIES, draw_commands, evaluation_task, steps_per_draw
+from eagle_rl.evaluation.protocol import (
+    NUM_VELOCITIES,
+    draw_commands,
+    evaluation_task,
+    finishing_ranges,
+    steps_per_draw,
+)
 
 Act = Callable[[TensorDict], Tensor]
 """Actions (P, 32) for observations (P,)."""
@@ -35,7 +41,7 @@ class PairedTrials:
             [make_env(cfg.robots, size, _world(cfg, randomized)[1], seed) for size, randomized in worlds]
             for _ in range(2)
         )
-        worst = [max(map(abs, getattr(task.commands, name).finishing)) for name in COMMANDS]
+        worst = [max(map(abs, bounds)) for bounds in finishing_ranges(task.commands)]
         self._fallen_errors = torch.tensor(worst, device=self._device)
         self._units = torch.tensor(search.error_units, device=self._device)
 

@@ -12,6 +12,7 @@ from rich.console import Console
 
 from eagle_rl.config.schema import ExperimentCfg
 from eagle_rl.evaluation.evaluate import EvaluationResult, MakeEnv, evaluate
+from eagle_rl.evaluation.protocol import finishing_ranges
 from eagle_rl.evaluation.report import pooled_score
 from eagle_rl.machine import own_cores
 from eagle_rl.models.precision import set_up_torch
@@ -154,6 +155,7 @@ class Worker:
             robots=robots,
             seed=cfg.seed,
             env_steps=training_steps(checkpoint),
+            ranges=finishing_ranges(cfg.task.commands),
         )
         patiently(lambda: write_atomically(job.folder / RESULT, result.to_json().encode()))
-        return pooled_score(robots)
+        return pooled_score(robots, ev, result.ranges)
