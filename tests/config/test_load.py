@@ -112,6 +112,18 @@ def test_a_base_given_as_a_path_is_looked_for_beside_its_file():
     assert load_experiment("mine/second.yaml").seed == 7
 
 
+def test_a_group_given_as_a_path_is_looked_for_beside_the_file_it_is_written_in():
+    Path("mine").mkdir()
+    Path("slow.yaml").write_text("gait: {frequency: 1}\n", encoding="utf-8")
+    Path("mine/quick.yaml").write_text("gait: {frequency: 3}\n", encoding="utf-8")
+    Path("mine/named.yaml").write_text("base: ppo\ntask: quick.yaml\n", encoding="utf-8")
+    Path("mine/within.yaml").write_text("base: ppo\ntask: {base: quick.yaml}\n", encoding="utf-8")
+    Path("inherits.yaml").write_text("base: mine/named.yaml\n", encoding="utf-8")
+    for name in ("mine/named.yaml", "mine/within.yaml", "inherits.yaml"):
+        assert load_experiment(name).task.gait.frequency == 3.0, name
+    assert load_experiment("mine/named.yaml", ["task=slow.yaml"]).task.gait.frequency == 1.0, "as on any command line"
+
+
 def test_a_path_names_the_experiment_after_its_file():
     assert load_experiment(write("base: ppo\n")).name == "mine"
 
