@@ -224,7 +224,7 @@ class EaglePPO(PPO):
         return iteration
 
     def adopt(self, learner: dict[str, Any]) -> None:
-        """Take over critic and learning rate of what :meth:`save` returned, for a policy that acts alike.
+        """Take over critic and learning rate of what :meth:`save` returned, of a policy that acted alike.
 
         With a fresh critic, at the first learning rate, a residual falls before it has learned anything.
         """

@@ -74,12 +74,3 @@ def mirror_loss(
         live: see the module.
     """
     return masked_square(mean.detach() - mean_of_mirrored[:, perm] * sign, mask, live)
-
-
-def kickstarting_loss(teacher_mean: Tensor, teacher_std: Tensor, mean: Tensor, std: Tensor, mask: Tensor) -> Tensor:
-    """KL(pi_s || pi_g) of Gaussians (N, S) over live slots [nat], shape (N,) (Kickstarting baseline of the paper)."""
-    absent = 1 - mask
-    teacher_std, std = teacher_std + absent, std + absent
-    variance_ratio = (teacher_std / std).square()
-    distance = ((teacher_mean - mean) / std).square()
-    return 0.5 * (variance_ratio + distance - 1 - torch.log(variance_ratio)).sum(dim=1)

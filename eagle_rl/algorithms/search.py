@@ -19,6 +19,7 @@ from torch import Tensor
 
 from eagle_rl.config.schema import SearchCfg
 from eagle_rl.models import EagleActor
+from eagle_rl.models.sides import partners
 
 MOMENTUM = 0.8
 """Share of the last direction that is kept in the next."""
@@ -112,14 +113,13 @@ class LastLayerSearch:
         parity, turned = torch.linalg.eigh(0.5 * (across + across.T))
         clear = parity.abs() > MIN_PARITY
         perm, sign = mirror
-        partner = (perm[slots].unsqueeze(1) == slots).int().argmax(dim=1)
         even_or_odd = torch.nn.functional.pad(parity[clear].sign(), (0, 1), value=1.0)
         return cls(
             cfg,
             slots=slots,
             mean=mean,
             directions=turned.T[clear] @ scaled,
-            partner=partner,
+            partner=partners(slots, perm),
             sign=sign[slots].unsqueeze(1) * even_or_odd,
             num_generations=num_generations,
             seed=seed,

@@ -15,7 +15,7 @@ from eagle_rl.algorithms.sharing import Share
 from eagle_rl.config.schema import AlgoCfg
 from eagle_rl.models import EagleActor
 from eagle_rl.models.actor import ACTOR_INPUTS
-from eagle_rl.models.distribution import entropy, log_prob
+from eagle_rl.models.distribution import entropy, kl_divergence, log_prob
 from eagle_rl.models.sides import MirrorMap, Sides
 
 
@@ -152,7 +152,7 @@ class Distill:
 
 
 class Kickstart:
-    """alpha exp(-lambda t) KL(pi_s || pi_g) towards the specialists' labels, t in updates."""
+    """alpha exp(-lambda t) KL(pi_s || pi_g) towards the specialists' labels, t in updates (the paper's baseline)."""
 
     def __init__(self, alpha: float, decay: float) -> None:
         """Start at weight ``alpha`` and decay at the rate ``decay``, lambda."""
@@ -160,10 +160,8 @@ class Kickstart:
 
     def __call__(self, policy: Policy, share: Share, log: Log) -> Tensor:
         """Weighted loss."""
-        mask = share["slot_mask"]
-        rows = losses.kickstarting_loss(
-            share["teacher_action"], share["teacher_std"], policy.mean, policy.std * mask, mask
-        )
+        std = policy.std * share["slot_mask"]
+        rows = kl_divergence(share["teacher_action"], share["teacher_std"], policy.mean, std)
         log.add("Distill/kickstart_kl", rows)
         return self.weight(share["num_updates"]) * rows.sum() / share.size
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from eagle_rl.config.schema import EvaluationCfg, ExperimentCfg
+from eagle_rl.config.schema import EvaluationCfg, ExperimentCfg, Range
 from eagle_rl.errors import ConfigError
 
 from .arguments import count, device, require_folder, seconds
@@ -85,6 +85,8 @@ class _Trial:
     policy: Policy
     protocol: EvaluationCfg
     robots: tuple[str, ...]
+    ranges: tuple[Range, ...]
+    """Of the commands."""
 
 
 def _split(word: str) -> tuple[str | None, Path]:
@@ -117,13 +119,14 @@ def _protocol(ev: EvaluationCfg, args: argparse.Namespace) -> EvaluationCfg:
 def _find(word: str, args: argparse.Namespace) -> tuple[str, EvaluationResult | _Trial]:
     """The method a word of the command line names, and its stored result or the policy that is to be judged."""
     from eagle_rl.evaluation.evaluate import EvaluationResult
+    from eagle_rl.evaluation.protocol import finishing_ranges
 
     name, path = _split(word)
     if _is_result(path):
         return name or path.stem, EvaluationResult.read(path)
     policy = load_policy(path, args.device)
     ev, robots = _protocol(policy.cfg.evaluation, args), chosen_robots(args.robots, policy.cfg)
-    return name or _method(policy.cfg), _Trial(policy, ev, robots)
+    return name or _method(policy.cfg), _Trial(policy, ev, robots, finishing_ranges(policy.cfg.task.commands))
 
 
 def _judge(name: str, trial: _Trial, console: Console) -> EvaluationResult:
@@ -146,7 +149,8 @@ def _judge(name: str, trial: _Trial, console: Console) -> EvaluationResult:
         robots=scores,
         seed=cfg.seed,
         env_steps=policy.env_steps,
-        unseen=tuple(robot for robot in robots if robot not in cfg.robots),
+        unseen=tuple(robot for robot in robots if not policy.knows(robot)),
+        ranges=trial.ranges,
     )
 
 
@@ -158,7 +162,7 @@ def main(argv: Sequence[str]) -> int:
 
     from eagle_rl.evaluation.metrics import SUBSETS
     from eagle_rl.evaluation.render import to_markdown
-    from eagle_rl.evaluation.report import common_protocol, tracking_table
+    from eagle_rl.evaluation.report import common_protocol, common_ranges, tracking_table
 
     if args.subset not in SUBSETS:
         raise ConfigError(f"--subset: got {args.subset!r}, expected one of {', '.join(SUBSETS)}.")
@@ -167,6 +171,7 @@ def main(argv: Sequence[str]) -> int:
     console = Console(stderr=True)
     found = [_find(word, args) for word in args.checkpoints]
     common_protocol(each.protocol for _, each in found)  # before anything is judged, which takes minutes
+    common_ranges(each.ranges for _, each in found)
     results: dict[str, list[EvaluationResult]] = {}
     for method, each in found:
         result = _judge(method, each, console) if isinstance(each, _Trial) else each

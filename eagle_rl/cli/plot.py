@@ -172,6 +172,7 @@ def _bodies(args: argparse.Namespace) -> dict[str, Figure]:
 def _swept(args: argparse.Namespace, sweeps: Mapping[str, Sweep]) -> dict[str, Figure]:
     """Every sweep side by side; the numbers as json."""
     from eagle_rl.evaluation import plots
+    from eagle_rl.evaluation.protocol import finishing_ranges
     from eagle_rl.evaluation.robustness import sweep
 
     figures = {}
@@ -179,7 +180,8 @@ def _swept(args: argparse.Namespace, sweeps: Mapping[str, Sweep]) -> dict[str, F
         cfg, make_env = policy.cfg, make_env_factory(policy.cfg.run)
         ev = _protocol(args, cfg)
         scores = {kind: sweep(policy.act, make_env, robots, cfg.task, ev, through) for kind, through in sweeps.items()}
-        figures[name] = plots.robustness((sweeps[kind], scores[kind]) for kind in sweeps)
+        panels = [(sweeps[kind], scores[kind]) for kind in sweeps]
+        figures[name] = plots.robustness(panels, ev, finishing_ranges(cfg.task.commands))
         plain = {
             kind: {str(value): {robot: _brief(m) for robot, m in scored.items()} for value, scored in by_value.items()}
             for kind, by_value in scores.items()

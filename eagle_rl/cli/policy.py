@@ -31,10 +31,18 @@ class Policy:
     """Its mean actions: the actor's or, of a corrected specialist, those with their correction."""
     cfg: ExperimentCfg
     """The experiment it was trained in, to be run on the device asked for and on all cores of this machine."""
+    robots: tuple[str, ...]
+    """Those it was trained on, by the names in their files."""
     sha256: str
     """Of its checkpoint."""
     env_steps: int | None
     """What it has cost, if known."""
+
+    def knows(self, robot: str) -> bool:
+        """Whether it was trained on a robot, given by name or path; earlier versions kept the path."""
+        from envs.robots.load import load_robot
+
+        return not {robot, load_robot(robot).name}.isdisjoint(self.robots)
 
 
 def load_policy(path: Path, device: str = "cpu") -> Policy:
@@ -65,7 +73,7 @@ def load_policy(path: Path, device: str = "cpu") -> Policy:
     correction = load_correction(checkpoint, device)
     act = actor if correction is None else CorrectedPolicy(actor, correction)
     env_steps = manifest["env_steps"] if checkpoint.suffix == SUFFIX else training_steps(checkpoint)
-    return Policy(checkpoint, actor, act, cfg, manifest["sha256"], env_steps)
+    return Policy(checkpoint, actor, act, cfg, tuple(manifest["robots"]), manifest["sha256"], env_steps)
 
 
 def chosen_robots(text: str | None, cfg: ExperimentCfg) -> tuple[str, ...]:

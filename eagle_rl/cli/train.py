@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING
 from eagle_rl.config.compose import known_names
 from eagle_rl.config.load import load_experiment, to_yaml
 from eagle_rl.config.schema import ExperimentCfg
-from eagle_rl.errors import ConfigError
+from eagle_rl.errors import ConfigError, RobotError
 from eagle_rl.runners.plan import plan_stages
 from eagle_rl.runners.provenance import Provenance, content_hash, slot_table_hash
 
@@ -78,6 +79,12 @@ def _provenance(cfg: ExperimentCfg) -> Provenance:
     from envs.robots.slots import SLOT_NAMES
 
     specs = [load_robot(name) for name in cfg.robots]
+    for first, second in itertools.combinations(specs, 2):
+        if first.name == second.name:
+            raise RobotError(
+                f"robots: {first.yaml_path} and {second.yaml_path} are both called {first.name!r}; expected a name of "
+                "its own for each, change `name:` in one."
+            )
     robots = {s.name: content_hash([p.read_text(encoding="utf-8") for p in (s.yaml_path, s.urdf_path)]) for s in specs}
     return Provenance(config=asdict(cfg), robots=robots, slot_table_hash=slot_table_hash(SLOT_NAMES))
 

@@ -1,7 +1,8 @@
 """Layers: an experiment is its base, then its own keys, then a scale, then the command line; later values win.
 
 ``base: NAME`` in any file starts from another file of the same folder. ``task: NAME`` and ``algo: NAME`` in an
-experiment (or ``base:`` inside them) start that group afresh from a file in ``cfg/task`` or ``cfg/algo``.
+experiment (or ``base:`` inside them) start that group afresh from a file in ``cfg/task`` or ``cfg/algo``. Where a name
+is the path of a YAML file, it starts from the folder of the file it is written in.
 """
 
 from __future__ import annotations
@@ -72,29 +73,29 @@ def load_file(kind: str, path: Path, seen: tuple[Path, ...] = ()) -> Node:
         raise ConfigError(f"{node.where}: base files run in a circle: {' -> '.join(p.stem for p in (*seen, path))}.")
     base = node.children.pop("base", None)
     if base is None:
-        return layer(Node({}, node.where), node) if kind == "experiment" else node
+        return layer(Node({}, node.where), node, path.parent) if kind == "experiment" else node
     parent = load_file(kind, find_file(kind, _base_name(base), base.where, path.parent), (*seen, path))
     if kind != "experiment":
         return merge(parent, node)
     inherited = {key: value for key, value in parent.children.items() if key not in _NOT_INHERITED}
-    return layer(Node(inherited, parent.where), node)
+    return layer(Node(inherited, parent.where), node, path.parent)
 
 
-def _resolve_group(kind: str, node: Node) -> Node | None:
+def _resolve_group(kind: str, node: Node, folder: Path) -> Node | None:
     """The group started afresh from the file it names, or None if it names none."""
     name = node if isinstance(node.value, str) else node.children.get("base")
     if name is None:
         return None
-    start = load_file(kind, find_file(kind, _base_name(name), name.where))
+    start = load_file(kind, find_file(kind, _base_name(name), name.where, folder))
     own = {key: value for key, value in node.children.items() if key != "base"}
     return merge(start, Node(own, node.where))
 
 
-def layer(parent: Node, own: Node) -> Node:
-    """An experiment's own keys over its parent's; a group that names a file replaces the parent's group."""
+def layer(parent: Node, own: Node, folder: Path = Path()) -> Node:
+    """An experiment's own keys, written in ``folder``, over its parent's; a group that names a file replaces that."""
     base, top = dict(parent.children), dict(own.children)
     for kind in GROUPS:
-        fresh = _resolve_group(kind, top[kind]) if kind in top else None
+        fresh = _resolve_group(kind, top[kind], folder) if kind in top else None
         if fresh is not None:
             base.pop(kind, None)
             top[kind] = fresh

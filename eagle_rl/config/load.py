@@ -33,7 +33,8 @@ def load_experiment(name_or_path: str, overrides: Sequence[str] = (), scale: str
     path = find_file("experiment", name_or_path)
     tree = load_file("experiment", path)
     if scale is not None:
-        tree = layer(tree, read_yaml(find_file("scale", scale)))
+        scale_path = find_file("scale", scale)
+        tree = layer(tree, read_yaml(scale_path), scale_path.parent)
     tree = layer(tree, parse_overrides(overrides))
     tree.children.setdefault("name", Node(path.stem, shown(path)))
     faults: list[str] = []

@@ -105,7 +105,8 @@ class AlgoCfg:
     mirror_fraction: float = 0.25
     """Share of each minibatch the mirror loss is computed on (ours)."""
     use_ppo_loss: bool = True
-    """Off leaves only the imitation losses: pure DAgger (ablation)."""
+    """Whether distillation has PPO's loss too. Off leaves only the imitation losses: pure DAgger (ablation). Stages
+    that imitate nobody always have it."""
     action_loss_coef: float = 0.02
     """alpha, weight of L_a in distillation (paper)."""
     action_loss_unit: Literal["action", "noise"] = "action"

@@ -6,6 +6,7 @@ import dataclasses
 import math
 import re
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 from .schema import CommandRangeCfg, EvaluationCfg, ExperimentCfg, SimCfg
@@ -110,6 +111,8 @@ POSITIVE_ITEMS = {f"algo.network.{part}_dims" for part in ("encoder", "estimator
     "algo.learning_rate_range",
     "task.observations.scales.command",
 }
+_OF_ROUNDS = ("teachers", "search_env_steps", "correction_env_steps", "max_rounds", "start_share")
+"""Values of the plan for rounds of EAGLE or Kickstarting."""
 _POSITIVE_RANGES = re.compile(r"task\.randomization\.(?:friction|(?!init_)\w+_scale)")
 
 
@@ -140,6 +143,8 @@ def _scalar_fault(path: str, value: float, default: float) -> str | None:
 def _sequence_fault(path: str, value: tuple[Any, ...]) -> str | None:
     if any(isinstance(v, str) for v in value):
         return None
+    if not value and path.endswith("_dims"):
+        return "got [], expected at least one layer"
     if not all(abs(v) <= _MAX_ITEM for v in value):
         return f"got {list(value)}, expected finite numbers of at most {_MAX_ITEM:g}"
     if (path in POSITIVE_ITEMS or _POSITIVE_RANGES.match(path)) and min(value, default=1) <= 0:
@@ -206,14 +211,18 @@ def _task_faults(cfg: ExperimentCfg) -> Iterator[Fault]:
 
 
 def _learner_faults(cfg: ExperimentCfg) -> Iterator[Fault]:
-    algo = cfg.algo
-    batch = cfg.num_envs * algo.num_steps_per_env
-    if algo.num_mini_batches > 0 and batch % algo.num_mini_batches:
-        yield (
-            "algo.num_mini_batches",
-            f"{algo.num_mini_batches} does not divide the batch of num_envs {cfg.num_envs} x "
-            f"num_steps_per_env {algo.num_steps_per_env} = {batch}",
-        )
+    algo, plan = cfg.algo, cfg.plan
+    pools = {"num_envs": cfg.num_envs}
+    if plan.specialist_env_steps and plan.specialist_num_envs:
+        pools["plan.specialist_num_envs"] = plan.specialist_num_envs
+    for name, num_envs in pools.items():
+        batch = num_envs * algo.num_steps_per_env
+        if algo.num_mini_batches > 0 and batch % algo.num_mini_batches:
+            yield (
+                "algo.num_mini_batches",
+                f"{algo.num_mini_batches} does not divide the batch of {name} {num_envs} x "
+                f"num_steps_per_env {algo.num_steps_per_env} = {batch}",
+            )
     low, high = algo.learning_rate_range
     if not low <= algo.learning_rate <= high:
         yield "algo.learning_rate", f"{algo.learning_rate:g} is outside learning_rate_range [{low:g}, {high:g}]"
@@ -225,17 +234,18 @@ def _learner_faults(cfg: ExperimentCfg) -> Iterator[Fault]:
 def _plan_faults(cfg: ExperimentCfg) -> Iterator[Fault]:
     if not cfg.robots:
         yield "robots", "expected at least one robot"
-    repeated = sorted({name for name in cfg.robots if cfg.robots.count(name) > 1})
+    stems = [Path(name).stem for name in cfg.robots]
+    repeated = [name for name, stem in zip(cfg.robots, stems, strict=True) if stems.count(stem) > 1]
     if repeated:
-        yield "robots", f"named twice: {', '.join(repeated)}"
+        names = ", ".join(dict.fromkeys(repeated))
+        yield "robots", f"named twice: {names}; expected files of different names, after which stages are named"
     if cfg.num_envs < len(cfg.robots):
         yield "num_envs", f"{cfg.num_envs} is less than one environment for each of {len(cfg.robots)} robots"
     plan = cfg.plan
-    yield from _teacher_faults(cfg)
+    yield from _method_faults(cfg)
     own = "specialist" in plan.teachers or not plan.teachers or plan.max_rounds > 1
     if plan.method != "ppo":
-        others = 0 if plan.method == "compass" else plan.search_env_steps + plan.correction_env_steps
-        specialists = plan.specialist_env_steps + others
+        specialists = plan.specialist_env_steps + plan.search_env_steps + plan.correction_env_steps
         budgets = {"specialist_env_steps": specialists} if own else {}
         budgets["distill_env_steps"] = plan.distill_env_steps
         for key in (key for key, budget in budgets.items() if budget == 0):
@@ -251,12 +261,19 @@ def _plan_faults(cfg: ExperimentCfg) -> Iterator[Fault]:
         yield "name", f"got {cfg.name!r}, expected letters, digits, - and _: it names the run's folder"
 
 
-def _teacher_faults(cfg: ExperimentCfg) -> Iterator[Fault]:
-    teachers, method = cfg.plan.teachers, cfg.plan.method
-    if teachers and len(teachers) != len(cfg.robots):
-        yield "plan.teachers", f"{len(teachers)} named, expected one for each of {len(cfg.robots)} robots"
-    if teachers and method not in ("eagle", "kickstarting"):
-        yield "plan.teachers", f"named, but method {method} distils no specialists; expected eagle or kickstarting"
+def _method_faults(cfg: ExperimentCfg) -> Iterator[Fault]:
+    """What is asked of rounds of specialists and distillation, where there is no such round."""
+    plan, method = cfg.plan, cfg.plan.method
+    if plan.teachers and len(plan.teachers) != len(cfg.robots):
+        yield "plan.teachers", f"{len(plan.teachers)} named, expected one for each of {len(cfg.robots)} robots"
+    if method in ("eagle", "kickstarting"):
+        return
+    unused = {f"plan.{key}": getattr(plan, key) for key in _OF_ROUNDS} | {"algo.use_ppo_loss": cfg.algo.use_ppo_loss}
+    defaults = dict(leaves(ExperimentCfg(name=cfg.name)))
+    for path, value in unused.items():
+        if value != defaults[path]:
+            got = list(value) if isinstance(value, tuple) else value
+            yield path, f"got {got}, but method {method} has no rounds; leave it out, or use eagle or kickstarting"
 
 
 def _correction_faults(cfg: ExperimentCfg) -> Iterator[Fault]:

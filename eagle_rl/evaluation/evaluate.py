@@ -13,10 +13,17 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from eagle_rl.config.schema import EvaluationCfg, TaskCfg
+from eagle_rl.config.schema import CommandsCfg, EvaluationCfg, Range, TaskCfg
 from eagle_rl.errors import CheckpointError
 from eagle_rl.evaluation.metrics import SETTLING_TIME_S, RobotMetrics, TrackingAccumulator
-from eagle_rl.evaluation.protocol import draw_commands, evaluation_task, judged_commands, step_dt, steps_per_draw
+from eagle_rl.evaluation.protocol import (
+    draw_commands,
+    evaluation_task,
+    finishing_ranges,
+    judged_commands,
+    step_dt,
+    steps_per_draw,
+)
 
 FORMAT = 1
 """Version of the JSON an evaluation is stored as."""
@@ -68,6 +75,8 @@ class EvaluationResult:
     """Environment steps the policy has cost, if known."""
     unseen: tuple[str, ...] = ()
     """Robots the policy was not trained on."""
+    ranges: tuple[Range, ...] = finishing_ranges(CommandsCfg())
+    """What the commands were drawn from; earlier versions, which did not keep it, are taken to have had the default."""
 
     def to_json(self) -> str:
         """One JSON document."""
@@ -86,6 +95,7 @@ class EvaluationResult:
             seed=data["seed"],
             env_steps=data["env_steps"],
             unseen=tuple(data.get("unseen", ())),
+            ranges=tuple(tuple(bounds) for bounds in data.get("ranges", cls.ranges)),
         )
 
     @classmethod

@@ -11,11 +11,12 @@ from matplotlib.figure import Figure as Figure  # re-exported, so that only this
 from numpy.typing import NDArray
 from PIL import Image
 
+from eagle_rl.config.schema import EvaluationCfg, Range
 from eagle_rl.evaluation.curves import Curve, RoundScores
 from eagle_rl.evaluation.estimator import ChannelScore, EstimatorReport
 from eagle_rl.evaluation.latents import Embeddings
 from eagle_rl.evaluation.metrics import RobotMetrics
-from eagle_rl.evaluation.reference import STAND_STILL
+from eagle_rl.evaluation.report import pooled_score
 from eagle_rl.evaluation.response import Response
 from eagle_rl.evaluation.robustness import Sweep
 
@@ -137,16 +138,27 @@ def responses(all_responses: Sequence[Response]) -> Figure:
     return figure
 
 
-def robustness(panels: Iterable[tuple[Sweep, Mapping[float, Mapping[str, RobotMetrics]]]]) -> Figure:
-    """Survival (top) and mean error relative to standing still (bottom) over each disturbance."""
+def robustness(
+    panels: Iterable[tuple[Sweep, Mapping[float, Mapping[str, RobotMetrics]]]],
+    ev: EvaluationCfg,
+    ranges: Sequence[Range],
+) -> Figure:
+    """Survival (top) and mean error relative to standing still (bottom) over each disturbance.
+
+    Args:
+        panels: each disturbance, with the scores of every robot by its strength.
+        ev: the protocol.
+        ranges: what the commands were drawn from.
+    """
     sweeps = list(panels)
     figure, axes = _panels(2, len(sweeps))
     for column, (sweep, scores) in zip(axes.T, sweeps, strict=True):
         colours = _palette(next(iter(scores.values())))
         for i, (robot, colour) in enumerate(colours.items()):
             style = {"color": colour, "marker": MARKERS[i % 7], "markersize": 4, "label": robot}
-            column[0].plot(list(scores), [100 * score[robot].survival for score in scores.values()], **style)
-            column[1].plot(list(scores), [_relative(score[robot]) for score in scores.values()], **style)
+            own = [score[robot] for score in scores.values()]
+            column[0].plot(list(scores), [100 * metrics.survival for metrics in own], **style)
+            column[1].plot(list(scores), [pooled_score({robot: metrics}, ev, ranges) for metrics in own], **style)
         column[0].set_ylabel("survival [%]", fontsize=9)
         column[0].set_ylim(-3, 103)
         column[1].set_ylabel("error / standing still [-]", fontsize=9)
@@ -154,12 +166,6 @@ def robustness(panels: Iterable[tuple[Sweep, Mapping[float, Mapping[str, RobotMe
         column[1].set_xlabel(sweep.label, fontsize=9)
     _legend(figure, axes[0, 0], len(COLOURS))
     return figure
-
-
-def _relative(metrics: RobotMetrics) -> float:
-    """Mean charged error of one robot as a share of standing still."""
-    charged = metrics.subsets["all"].charged
-    return float(np.mean([e / floor for e, floor in zip(charged, STAND_STILL, strict=True) if e is not None]))
 
 
 def estimator_bars(report: EstimatorReport, floor: float = -0.5) -> Figure:

@@ -15,12 +15,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from eagle_rl.config.schema import CommandsCfg, EvaluationCfg, TaskCfg, TerrainCfg
+from eagle_rl.config.schema import CommandsCfg, EvaluationCfg, Range, TaskCfg, TerrainCfg
 
 COMMANDS = ("lin_vel_x", "lin_vel_y", "ang_vel_z", "base_height", "body_pitch")
 """Names of the five commands in their order in every (..., 5) tensor."""
 NUM_VELOCITIES = 3
 """The first three are velocities, all zero where a robot is to stand; the others are postures."""
+
+
+def finishing_ranges(commands: CommandsCfg) -> tuple[Range, ...]:
+    """What the five commands are drawn from, in their order."""
+    return tuple(getattr(commands, name).finishing for name in COMMANDS)
 
 
 def step_dt(task: TaskCfg) -> float:
@@ -92,5 +97,5 @@ def draw_commands(commands: CommandsCfg, ev: EvaluationCfg, robot: str, num_envs
     """
     generator = np.random.default_rng([ev.seed, zlib.crc32(robot.encode())])
     unit = torch.from_numpy(generator.random((num_envs, num_draws(ev), len(COMMANDS))))
-    low, high = torch.tensor([getattr(commands, name).finishing for name in COMMANDS], dtype=torch.float64).T
+    low, high = torch.tensor(finishing_ranges(commands), dtype=torch.float64).T
     return (low + (high - low) * unit) * drawn_commands(ev, num_envs)

@@ -6,37 +6,47 @@ Transcribed from the paper's Tab. "Command-tracking errors" and Tab. "Unitree H1
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
-from eagle_rl.config.schema import EvaluationCfg
-from eagle_rl.evaluation.protocol import num_draws
+from eagle_rl.config.schema import CommandsCfg, EvaluationCfg, Range
+from eagle_rl.evaluation.protocol import NUM_VELOCITIES, finishing_ranges, num_draws
 
 Errors = tuple[float, float, float, float, float]
 
-STAND_STILL: Errors = (0.50, 0.20, 0.50, 0.15, 0.2125)
-"""Mean |c_d| on the finishing ranges: the errors of a robot that stands still, upright, at its nominal height."""
 
-BEST_CONSTANT: Errors = (0.45, 0.20, 0.50, 0.075, 0.20)
-"""Errors of the best behaviour that does not depend on the command: the middle of every range."""
+def _mean_size(bounds: Range) -> float:
+    """Mean |c| of a command that is uniform within bounds."""
+    low, high = bounds
+    return abs(low) if low == high else (high * abs(high) - low * abs(low)) / (2.0 * (high - low))
 
 
-def floors(ev: EvaluationCfg) -> dict[str, Errors]:
-    """What robots that ignore their command score in a protocol.
+def _mean_deviation(bounds: Range) -> float:
+    """Mean distance of such a command from the middle of its range."""
+    return (bounds[1] - bounds[0]) / 4.0
 
-    Where half of the draws have no velocity, the best constant velocity is zero too; so is the best constant posture
-    where postures stay at zero.
+
+def floors(ev: EvaluationCfg, ranges: Sequence[Range]) -> dict[str, tuple[float, ...]]:
+    """What robots that ignore their command score in a protocol, with commands from these ranges.
+
+    One stands still, upright, at its nominal height; the other does what is best of what does not depend on the
+    command: the middle of every range. Where half of the draws have no velocity, the best constant velocity is zero
+    too; so is the best constant posture where postures stay at zero.
     """
-    constant = {"stand still": STAND_STILL, "best constant": BEST_CONSTANT}
+    errors = {"stand still": [*map(_mean_size, ranges)], "best constant": [*map(_mean_deviation, ranges)]}
+    velocities, postures = slice(NUM_VELOCITIES), slice(NUM_VELOCITIES, None)
+    if ev.protocol == "standing":
+        walking = 0.5 if num_draws(ev) > 1 else 0.0
+        shared = [walking * error for error in errors["stand still"][velocities]]
+        errors = {name: [*shared, *own[postures]] for name, own in errors.items()}
     if ev.protocol == "upright":
-        return {name: (v_x, v_y, omega, 0.0, 0.0) for name, (v_x, v_y, omega, _, _) in constant.items()}
-    if ev.protocol != "standing":
-        return constant
-    walking = 0.5 if num_draws(ev) > 1 else 0.0
-    v_x, v_y, omega = (walking * error for error in STAND_STILL[:3])
-    return {
-        "stand still": (v_x, v_y, omega, *STAND_STILL[3:]),
-        "best constant": (v_x, v_y, omega, *BEST_CONSTANT[3:]),
-    }
+        errors = {name: [*own[velocities], *(0.0 for _ in own[postures])] for name, own in errors.items()}
+    return {name: tuple(own) for name, own in errors.items()}
+
+
+def score_units(ev: EvaluationCfg, ranges: Sequence[Range]) -> tuple[float, ...]:
+    """Errors that count as 1 in a score: those of standing still, or, of a command that is always zero, the usual."""
+    usual = map(_mean_size, finishing_ranges(CommandsCfg()))
+    return tuple(floor or size for floor, size in zip(floors(ev, ranges)["stand still"], usual, strict=True))
 
 
 PAPER: Mapping[str, Mapping[str, Errors]] = {

@@ -7,12 +7,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Literal
 
-from eagle_rl.config.schema import EvaluationCfg
+from eagle_rl.config.schema import EvaluationCfg, Range
 from eagle_rl.errors import ConfigError
 from eagle_rl.evaluation.evaluate import EvaluationResult
 from eagle_rl.evaluation.metrics import RobotMetrics
 from eagle_rl.evaluation.protocol import COMMANDS, num_draws
-from eagle_rl.evaluation.reference import PAPER, PAPER_H1, STAND_STILL, Errors, floors
+from eagle_rl.evaluation.reference import PAPER, PAPER_H1, Errors, floors, score_units
 
 Falls = Literal["charged", "errors"]
 """``charged`` counts |c_d| for every step after a fall, ``errors`` leaves those steps out."""
@@ -54,12 +54,12 @@ class Table:
     """sha256 of every checkpoint, by method."""
 
 
-def pooled_score(robots: Mapping[str, RobotMetrics]) -> float:
+def pooled_score(robots: Mapping[str, RobotMetrics], ev: EvaluationCfg, ranges: Sequence[Range]) -> float:
     """Mean over robots and commands of the charged error as a share of standing still: 0 is perfect, 1 is idle."""
     shares = [
-        charged / floor
+        charged / unit
         for metrics in robots.values()
-        for charged, floor in zip(metrics.subsets["all"].charged, STAND_STILL, strict=True)
+        for charged, unit in zip(metrics.subsets["all"].charged, score_units(ev, ranges), strict=True)
         if charged is not None
     ]
     return statistics.fmean(shares)
@@ -113,6 +113,21 @@ def common_protocol(protocols: Iterable[EvaluationCfg]) -> EvaluationCfg:
     return first
 
 
+def common_ranges(ranges: Iterable[tuple[Range, ...]]) -> tuple[Range, ...]:
+    """What the commands of all results were drawn from.
+
+    Raises:
+        ConfigError: from different ranges.
+    """
+    first, *others = dict.fromkeys(ranges)
+    if others:
+        raise ConfigError(
+            f"A table needs results of the same commands, got {len(others) + 1} sets of finishing ranges: "
+            "evaluate all methods alike."
+        )
+    return first
+
+
 def tracking_table(
     results: Mapping[str, Sequence[EvaluationResult]],
     subset: str = "all",
@@ -128,15 +143,16 @@ def tracking_table(
         paper: the paper's errors by method and robot; not shown for robots a method was not trained on, nor
             for upright or standing robots, which the paper does not judge by themselves.
     """
-    ev = common_protocol(result.protocol for runs in results.values() for result in runs)
+    every = [result for runs in results.values() for result in runs]
+    ev, ranges = common_protocol(result.protocol for result in every), common_ranges(result.ranges for result in every)
     paper = paper if ev.protocol in ("single", "joint") else {}
-    robots = list(dict.fromkeys(robot for runs in results.values() for result in runs for robot in result.robots))
+    robots = list(dict.fromkeys(robot for result in every for robot in result.robots))
     rows = []
     for robot in robots:
         if subset == "all":
             rows += [
                 Row(robot=robot, method=name, cells=tuple(Cell(mean=e) for e in errors))
-                for name, errors in floors(ev).items()
+                for name, errors in floors(ev, ranges).items()
             ]
         for method, runs in results.items():
             judged = [run for run in runs if robot in run.robots]

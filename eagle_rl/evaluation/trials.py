@@ -12,14 +12,20 @@ from torch import Tensor
 
 from eagle_rl.config.schema import EvaluationCfg, ExperimentCfg, TaskCfg
 from eagle_rl.evaluation.evaluate import MakeEnv
-from eagle_rl.evaluation.protocol import COMMANDS, NUM_VELOCITIES, draw_commands, evaluation_task, steps_per_draw
+from eagle_rl.evaluation.protocol import (
+    NUM_VELOCITIES,
+    draw_commands,
+    evaluation_task,
+    finishing_ranges,
+    steps_per_draw,
+)
 
 Act = Callable[[TensorDict], Tensor]
 """Actions (P, 32) for observations (P,)."""
 
 
 class PairedTrials:
-    """Two lots of P environments of one robot, equal to the last bit, some of them randomized as in training."""
+    """Two lots of P environments of one robot, compared from one state, some of them randomized as in training."""
 
     def __init__(self, cfg: ExperimentCfg, make_env: MakeEnv, seed: int) -> None:
         """Build both lots from ``cfg.search`` and the one robot of ``cfg``, in the physics of training."""
@@ -35,7 +41,7 @@ class PairedTrials:
             [make_env(cfg.robots, size, _world(cfg, randomized)[1], seed) for size, randomized in worlds]
             for _ in range(2)
         )
-        worst = [max(map(abs, getattr(task.commands, name).finishing)) for name in COMMANDS]
+        worst = [max(map(abs, bounds)) for bounds in finishing_ranges(task.commands)]
         self._fallen_errors = torch.tensor(worst, device=self._device)
         self._units = torch.tensor(search.error_units, device=self._device)
 
@@ -70,6 +76,24 @@ class PairedTrials:
         stands = chance < self._cfg.standing_probability
         commands[..., :NUM_VELOCITIES] *= ~stands.unsqueeze(2)
         return commands.float().to(self._device)
+
+    def compare(self, commands: Tensor, acts: tuple[Act, Act]) -> tuple[Tensor, Tensor]:
+        """Let both lots follow the same commands from the same state, each with policies of its own.
+
+        Whoever falls starts again and draws a world of its own; without the state of the first lot, robots that fell in
+        one lot alone would be in two worlds ever after.
+
+        Args:
+            commands: shape (P, draws, 5).
+            acts: the policies of each lot.
+
+        Returns:
+            What :meth:`follow` returns of both lots, (2, P) each.
+        """
+        first = self.state_dict()[0]
+        self.load_state_dict([first, first])
+        cost, fell = zip(*(self.follow(lot, commands, act) for lot, act in enumerate(acts)), strict=True)
+        return torch.stack(cost), torch.stack(fell)
 
     def follow(self, lot: int, commands: Tensor, act: Act) -> tuple[Tensor, Tensor]:
         """Let one lot follow commands from rest.
@@ -106,11 +130,6 @@ class PairedTrials:
         """Give each environment of a lot its command, (P, 5)."""
         for env, part in zip(self._lots[lot], commands.split(self._sizes), strict=True):
             env.pin_commands(part)
-
-    def align(self) -> None:
-        """Give the second lot the state of the first, after a trial of the first alone."""
-        first = self.state_dict()[0]
-        self.load_state_dict([first, first])
 
     def state_dict(self) -> list[list[dict[str, Any]]]:
         """State of both lots."""

@@ -12,6 +12,11 @@ MirrorMap = Mapping[str, tuple[Tensor, Tensor]]
 """Permutation and sign of each observation group and of ``actions``: mirrored = x[:, perm] * sign."""
 
 
+def partners(slots: Tensor, perm: Tensor) -> Tensor:
+    """Index in ``slots`` (S,) of the same joint on the other side, of which a mirror's permutation says the slot."""
+    return (perm[slots].unsqueeze(1) == slots).int().argmax(dim=1)
+
+
 class Sides(nn.Module):
     """Mirrors groups of columns; moves with a model and is no part of its weights."""
 

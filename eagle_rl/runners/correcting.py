@@ -21,6 +21,7 @@ from eagle_rl.errors import EagleWarning
 from eagle_rl.evaluation.evaluate import MakeEnv
 from eagle_rl.models.basis import monomials
 from eagle_rl.models.correction import FEEDBACK_HARMONICS, NUM_HARMONICS, NUM_SHIFTS, YAW, Correction
+from eagle_rl.models.sides import partners
 from eagle_rl.runners import checkpoint as ckpt
 from eagle_rl.runners.files import patiently
 from eagle_rl.runners.following import Followers
@@ -103,8 +104,7 @@ class CorrectionRunner:
             harm=low.new_zeros(0, terms),
             yaw_scales=low.new_tensor([scales.base_ang_vel, scales.command[YAW]]),
         )
-        partner = (perm[slots].unsqueeze(1) == slots).int().argmax(dim=1)
-        return correction, Mirror(command=env.mirror["command"], partner=partner, sign=sign[slots])
+        return correction, Mirror(command=env.mirror["command"], partner=partners(slots, perm), sign=sign[slots])
 
     def _tune(self, correction: Correction, mirror: Mirror, number: int) -> Correction:
         """The correction with the last gains, downhill of its own, with which commands not probed are followed best."""

@@ -8,7 +8,7 @@ import io
 import os
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -270,7 +270,7 @@ class EagleRunner(OnPolicyRunner):
         has a fresh one: measured by PPO's gradients its first steps would be several times as long as its rate says.
         """
         checkpoint = ckpt.load_checkpoint(Path(path), self.provenance.slot_table_hash)
-        self._require_same_shapes(checkpoint)
+        self.require_same_shapes(checkpoint)
         goes_on = self.alg.cfg.use_ppo_loss
         self.alg.load(checkpoint.state["algorithm"], {"actor": True, "critic": True, "optimizer": goes_on})
 
@@ -308,7 +308,7 @@ class EagleRunner(OnPolicyRunner):
                 f"{checkpoint.path}: written by {len(processes)} processes, resumed by {self.gpu_world_size}. "
                 "Resume with as many processes."
             )
-        self._require_same_shapes(checkpoint)
+        self.require_same_shapes(checkpoint)
         local = processes[self.gpu_global_rank]
         self._require_fit(checkpoint, local)
         self.env.load_state_dict(local["env"])
@@ -336,10 +336,10 @@ class EagleRunner(OnPolicyRunner):
             except CheckpointError as error:
                 self.logger.warn(f"{error} Training goes on.")
 
-    def _require_same_shapes(self, checkpoint: ckpt.Checkpoint) -> None:
+    def require_same_shapes(self, checkpoint: ckpt.Checkpoint, networks: Sequence[str] = ("actor", "critic")) -> None:
         """Refuse weights that do not fit, before any is changed."""
-        for name, model in (("actor", self.alg.actor), ("critic", self.alg.critic)):
-            own = {key: tuple(x.shape) for key, x in model.state_dict().items()}
+        for name in networks:
+            own = {key: tuple(x.shape) for key, x in getattr(self.alg, name).state_dict().items()}
             saved = {key: tuple(x.shape) for key, x in checkpoint.state["algorithm"][f"{name}_state_dict"].items()}
             wrong = [f"{k}: {saved.get(k)}, expected {own.get(k)}" for k in own | saved if own.get(k) != saved.get(k)]
             if wrong:

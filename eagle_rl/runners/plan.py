@@ -64,6 +64,8 @@ class Stage:
     """Stage whose weights those of ``init`` are averaged with."""
     base: str | None = None
     """Stage whose policy's actions the specialists' are added to (COMPASS)."""
+    critic: str | None = None
+    """Stage whose critic and learning rate a residual begins with: PPO's last, a base that imitates learns neither."""
     demonstrations: bool = False
     """Whether the teachers act instead of the policy, and nothing but imitation is learned (COMPASS)."""
     world_model: bool = False
@@ -74,7 +76,9 @@ class Stage:
     def inputs(self) -> tuple[str, ...]:
         """Stages that must be done first."""
         return tuple(
-            dict.fromkeys(name for name in (self.init, self.start, self.base, *self.teachers) if name is not None)
+            dict.fromkeys(
+                name for name in (self.init, self.start, self.base, self.critic, *self.teachers) if name is not None
+            )
         )
 
     @property
@@ -194,6 +198,7 @@ def _compass(cfg: ExperimentCfg, demonstrator: str) -> list[Stage]:
             round=1,
             robots=(robot,),
             base=origin,
+            critic=demonstrator,
         )
         for robot in cfg.robots
     ]

@@ -58,7 +58,7 @@ class Provenance:
     config: Mapping[str, Any] = field(default_factory=dict)
     """The resolved experiment as plain values."""
     robots: Mapping[str, str] = field(default_factory=dict)
-    """Robot name to the hash of its files, in the order of the environment."""
+    """Name of each robot, as its own file has it, to the hash of its files, in the order of ``config``'s robots."""
     slot_table_hash: str = ""
     stage: str = "train"
     """Path of the stage in its run, e.g. ``round1/specialist_h1``."""
@@ -66,6 +66,10 @@ class Provenance:
     """Sha256 of the checkpoints this stage started from or learns from."""
     drifted: bool = False
     """Whether the run went on although something it depends on had changed."""
+
+    def name_of(self, robot: str) -> str:
+        """What the file of a robot calls it that the configuration may name by the path of that file."""
+        return dict(zip(self.config.get("robots", ()), self.robots, strict=False)).get(robot, robot)
 
     def as_manifest(self) -> dict[str, Any]:
         """Entries of a manifest, as JSON would return them."""

@@ -91,7 +91,6 @@ class SearchRunner:
             return self._actor(obs)
 
         self._trials.follow(0, self._trials.commands(self.stage.iterations), act)
-        self._trials.align()
         self.env_steps += self._trials.steps
         live = self._trials.observations()["slot_mask"][0].nonzero().flatten()
         return LastLayerSearch.along(
@@ -109,8 +108,8 @@ class SearchRunner:
         """Let both halves of every pair follow the same commands, and take a step; the generation's scalars by tag."""
         start, cpu_start = time.perf_counter(), time.process_time()
         commands = self._trials.commands(search.generation)
-        trials = [self._trials.follow(i, commands, self._changed(search, x)) for i, x in enumerate(search.pairs())]
-        cost, fell = (torch.stack(results) for results in zip(*trials, strict=True))
+        one_way, other_way = (self._changed(search, parameters) for parameters in search.pairs())
+        cost, fell = self._trials.compare(commands, (one_way, other_way))
         search.learn(cost[1] - cost[0])
         seconds, steps = time.perf_counter() - start, 2 * self._trials.steps
         self.env_steps += steps
@@ -132,12 +131,10 @@ class SearchRunner:
         """
         commands = self._trials.commands(self.stage.iterations + 1)
         nothing = torch.zeros_like(search.parameters)
-        costs = []
-        for lot, parameters in enumerate((nothing, search.parameters)):
-            everywhere = parameters.expand(self.cfg.search.num_pairs, -1, -1)
-            costs.append(self._trials.follow(lot, commands, self._changed(search, everywhere))[0].mean().item())
+        everywhere = (x.expand(self.cfg.search.num_pairs, -1, -1) for x in (nothing, search.parameters))
+        as_begun, as_found = (self._changed(search, parameters) for parameters in everywhere)
+        before, after = self._trials.compare(commands, (as_begun, as_found))[0].mean(dim=1).tolist()
         self.env_steps += 2 * self._trials.steps
-        before, after = costs
         outcome = f"{self.stage.name}: cost {before:.3f} -> {after:.3f} on commands that were not searched on"
         if after < before:
             Console(stderr=True).print(outcome, highlight=False)

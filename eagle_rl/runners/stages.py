@@ -73,7 +73,7 @@ def run_experiment(
     stages = plan_stages(cfg, team.size)
     for stage in stages:
         if stage.source and not resume:  # before anything is trained
-            open_teacher(cfg, stage, now.slot_table_hash)
+            open_teacher(cfg, stage, now)
     provenance = team.agree(lambda: open_plan(run_dir, now, stages, resume=resume, allow_drift=allow_drift))
     allow_drift |= provenance.drifted  # its checkpoints may be from before
     worker = Worker(cfg, stages, run_dir, make_env, provenance, team, allow_drift, jobs)

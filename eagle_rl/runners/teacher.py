@@ -18,20 +18,20 @@ from eagle_rl.runners.provenance import Provenance
 from eagle_rl.runners.root import tell_changed_meaning
 
 
-def open_teacher(cfg: ExperimentCfg, stage: Stage, slot_table_hash: str) -> tuple[Path, EagleActor, Manifest]:
+def open_teacher(cfg: ExperimentCfg, stage: Stage, provenance: Provenance) -> tuple[Path, EagleActor, Manifest]:
     """The file of a stage's ``source``, a checkpoint, a published file or a folder with one; its policy and manifest.
 
     Raises:
         CheckpointError: it is the policy of another robot, or cannot teach the experiment's network.
     """
-    named, robot = stage.source or "", stage.robots[0]
+    named, robot = stage.source or "", provenance.name_of(stage.robots[0])
     if not Path(named).exists():
         words = f"{', '.join(TEACHERS)} or a file or folder that is there"
         raise CheckpointError(f"plan.teachers: got {named!r}, expected {words}.{did_you_mean(named, TEACHERS)}")
     source = find_checkpoint(Path(named))
-    actor, manifest = load_actor(source, slot_table_hash=slot_table_hash)
+    actor, manifest = load_actor(source, slot_table_hash=provenance.slot_table_hash)
     require_whole(source, manifest)
-    if robot not in manifest["robots"]:
+    if {robot, stage.robots[0]}.isdisjoint(manifest["robots"]):  # where earlier versions had the path
         of = ", ".join(manifest["robots"])
         raise CheckpointError(
             f"plan.teachers: {source}: a policy of {of}, expected one of {robot}; teachers are in the order of robots."
@@ -67,7 +67,7 @@ def take_teacher(
     """
     path = checkpoints / "model_0.pt"
     if first:
-        source, actor, manifest = open_teacher(cfg, stage, provenance.slot_table_hash)
+        source, actor, manifest = open_teacher(cfg, stage, provenance)
         seen, shown = actor.architecture["observations"], sizes()
         faults = [
             f"{seen[group]} columns of {group}, not {shown[group]}"

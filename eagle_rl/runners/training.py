@@ -54,6 +54,8 @@ class Job:
     """Checkpoint whose weights those of ``init`` are averaged with."""
     base: Path | None
     """Checkpoint of the policy whose actions the specialists' are added to."""
+    critic: Path | None
+    """Checkpoint whose critic and learning rate a residual begins with."""
     make_env: MakeEnv
     provenance: Provenance
     check_claim: Callable[[], None]
@@ -64,11 +66,13 @@ class Job:
 
 
 def stage_cfg(cfg: ExperimentCfg, stage: Stage) -> ExperimentCfg:
-    """The experiment as one stage sees it: its robots and its task."""
+    """The experiment as one stage sees it: its robots, its task and, where nothing is imitated, PPO's loss."""
     task = warm_task(cfg.task) if stage.warm else cfg.task
     algo = cfg.algo
     if stage.demonstrations:
         algo = dataclasses.replace(algo, use_ppo_loss=False, kickstart_coef=1.0, kickstart_decay=0.0)
+    elif stage.imitation is None:
+        algo = dataclasses.replace(algo, use_ppo_loss=True)
     return dataclasses.replace(cfg, robots=stage.robots, num_envs=stage_num_envs(cfg, stage.kind), task=task, algo=algo)
 
 
@@ -174,9 +178,11 @@ def _make_runner(job: Job) -> EagleRunner:
     if bank is not None and stage.imitation is not None:
         runner.alg.imitate(bank, stage.imitation)
         runner.alg.imitation_updates = stage.iterations
-    if job.base is not None and base is not None and stage.kind == "residual":
+    if base is not None and job.critic is not None:
         begin_residual(runner.alg.actor, base)
-        runner.alg.adopt(load_checkpoint(job.base).state["algorithm"])
+        learner = load_checkpoint(job.critic)
+        runner.require_same_shapes(learner, ("critic",))
+        runner.alg.adopt(learner.state["algorithm"])
     return runner
 
 

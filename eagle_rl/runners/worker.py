@@ -12,6 +12,7 @@ from rich.console import Console
 
 from eagle_rl.config.schema import ExperimentCfg
 from eagle_rl.evaluation.evaluate import EvaluationResult, MakeEnv, evaluate
+from eagle_rl.evaluation.protocol import finishing_ranges
 from eagle_rl.evaluation.report import pooled_score
 from eagle_rl.machine import own_cores
 from eagle_rl.models.precision import set_up_torch
@@ -100,7 +101,7 @@ class Worker:
         provenance = dataclasses.replace(
             self.provenance,
             config=dataclasses.asdict(cfg),
-            robots={name: self.provenance.robots.get(name, "") for name in stage.robots},
+            robots={name: self.provenance.robots.get(name, "") for name in map(self.provenance.name_of, stage.robots)},
             stage=stage.name,
             parents=tuple(read_manifest(path)["sha256"] for path in inputs.values()),
         )
@@ -112,6 +113,7 @@ class Worker:
             teachers=tuple(inputs[name] for name in stage.teachers),
             start=None if stage.start is None else inputs[stage.start],
             base=None if stage.base is None else inputs[stage.base],
+            critic=None if stage.critic is None else inputs[stage.critic],
             make_env=self.make_env,
             provenance=provenance,
             check_claim=check_claim,
@@ -153,6 +155,7 @@ class Worker:
             robots=robots,
             seed=cfg.seed,
             env_steps=training_steps(checkpoint),
+            ranges=finishing_ranges(cfg.task.commands),
         )
         patiently(lambda: write_atomically(job.folder / RESULT, result.to_json().encode()))
-        return pooled_score(robots)
+        return pooled_score(robots, ev, result.ranges)

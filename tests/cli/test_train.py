@@ -112,6 +112,17 @@ def test_a_missing_urdf_is_a_robots_fault_and_leaves_nothing(runs, tmp_path, cap
     assert list(Path().iterdir()) == [Path("mine.yaml")]
 
 
+def test_two_robots_of_one_name_are_refused_and_leave_nothing(runs, capsys):
+    """In logs, tables and checkpoints robots go by the names in their files."""
+    source = data_root() / "cfg/robots/h1.yaml"
+    urdf = (data_root() / "assets/urdf/h1.urdf").as_posix()
+    text = source.read_text(encoding="utf-8").replace("../../assets/urdf/h1.urdf", urdf)
+    Path("mine.yaml").write_text(text, encoding="utf-8")
+    assert train("ppo", "robots=[h1, mine.yaml]") == 3
+    assert "mine.yaml are both called 'h1'; expected a name of its own for each" in capsys.readouterr().err
+    assert not runs
+
+
 def test_a_folder_that_cannot_be_written_is_named(runs, capsys):
     Path("taken").write_text("a file")
     assert train("smoke", "--out", "taken") == 2

@@ -113,6 +113,18 @@ def test_a_base_given_as_a_path_is_looked_for_beside_its_file():
     assert load_experiment("mine/second.yaml").seed == 7
 
 
+def test_a_group_given_as_a_path_is_looked_for_beside_the_file_it_is_written_in():
+    Path("mine").mkdir()
+    Path("slow.yaml").write_text("gait: {frequency: 1}\n", encoding="utf-8")
+    Path("mine/quick.yaml").write_text("gait: {frequency: 3}\n", encoding="utf-8")
+    Path("mine/named.yaml").write_text("base: ppo\ntask: quick.yaml\n", encoding="utf-8")
+    Path("mine/within.yaml").write_text("base: ppo\ntask: {base: quick.yaml}\n", encoding="utf-8")
+    Path("inherits.yaml").write_text("base: mine/named.yaml\n", encoding="utf-8")
+    for name in ("mine/named.yaml", "mine/within.yaml", "inherits.yaml"):
+        assert load_experiment(name).task.gait.frequency == 3.0, name
+    assert load_experiment("mine/named.yaml", ["task=slow.yaml"]).task.gait.frequency == 1.0, "as on any command line"
+
+
 def test_a_path_names_the_experiment_after_its_file():
     assert load_experiment(write("base: ppo\n")).name == "mine"
 
@@ -170,13 +182,19 @@ def test_a_wrong_override_is_named_with_what_was_expected(override, expected):
         ("algo.learning_rate=0.1", "0.1 is outside learning_rate_range [1e-05, 0.002]"),
         ("algo.network.init_std=2", "2 is outside std_range [0.1, 1"),
         ("algo.network.actor_dims=[64, 0]", "expected numbers above 0"),
+        ("algo.network.encoder_dims=[]", "algo.network.encoder_dims: got [], expected at least one layer"),
         ("task.commands.ang_vel_z.initial=[-2, 2]", "the curriculum only widens"),
         ("task.observations.scan_x=[0, 1, 0]", "at least one point"),
         ("robots=[]", "robots: expected at least one robot"),
-        ("robots=[h1, g1, h1]", "named twice: h1"),
+        ("robots=[h1, g1, h1]", "named twice: h1; "),
         ("plan.method=eagle", "needs a budget for this stage"),
         ("plan.teachers=[generalist]", "plan.teachers: 1 named, expected one for each of 5 robots"),
-        ("plan.teachers=[a, a, a, a, a]", "named, but method ppo distils no specialists"),
+        ("plan.teachers=[a, a, a, a, a]", "plan.teachers: got ['a', 'a', 'a', 'a', 'a'], but method ppo has no rounds"),
+        ("plan.search_env_steps=9", "plan.search_env_steps: got 9, but method ppo has no rounds"),
+        ("plan.correction_env_steps=9", "plan.correction_env_steps: got 9, but method ppo has no rounds"),
+        ("plan.max_rounds=2", "plan.max_rounds: got 2, but method ppo has no rounds"),
+        ("plan.start_share=0.5", "plan.start_share: got 0.5, but method ppo has no rounds"),
+        ("algo.use_ppo_loss=false", "algo.use_ppo_loss: got False, but method ppo has no rounds"),
         ("correction.num_steps=64", "correction.num_steps: got 64, expected 65 or more, to look ahead"),
         ("search.num_steps=40", "search.num_steps: got 40, expected more than search.settling_steps, 40"),
         ("search.error_units=[0.05, 0.08, 0, 0.02, 0.04]", "expected numbers above 0"),
@@ -193,8 +211,23 @@ def test_an_impossible_value_is_named_with_its_bound(override, expected):
 def test_a_search_may_take_the_place_of_specialists_training_but_not_of_residuals():
     overrides = ["plan.specialist_env_steps=0", "plan.search_env_steps=9"]
     assert load_experiment("eagle", overrides).plan.search_env_steps == 9
-    with pytest.raises(ConfigError, match=r"plan.specialist_env_steps: 0, but method compass needs a budget"):
-        load_experiment("fork_compass", overrides)
+    (fault,) = faults_of(*overrides, name="fork_compass")
+    assert "plan.search_env_steps: got 9, but method compass has no rounds; leave it out" in fault
+
+
+def test_robots_whose_stages_would_have_one_name_are_refused():
+    for folder in ("a", "b"):
+        Path(folder).mkdir()
+        Path(folder, "h1.yaml").touch()
+    for robots in ("h1, a/h1.yaml", "a/h1.yaml, b/h1.yaml"):
+        assert f"robots: named twice: {robots}; expected files" in faults_of(f"robots=[{robots}]", name="eagle")[0]
+
+
+def test_minibatches_divide_the_batch_of_specialists_too():
+    few = ["num_envs=350", "algo.num_mini_batches=7", "plan.specialist_num_envs=64"]
+    (fault,) = faults_of(*few, name="eagle")
+    assert "7 does not divide the batch of plan.specialist_num_envs 64 x num_steps_per_env 24 = 1536" in fault
+    load_experiment("eagle", [*few, "plan.specialist_env_steps=0", "plan.search_env_steps=9"])
 
 
 def test_specialists_need_a_budget_only_where_some_are_trained():

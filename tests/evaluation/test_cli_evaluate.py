@@ -18,6 +18,7 @@ from eagle_rl.config.schema import EvaluationCfg
 from eagle_rl.errors import ConfigError
 from eagle_rl.evaluation.evaluate import EvaluationResult
 from eagle_rl.models.correction import CorrectedPolicy
+from eagle_rl.paths import data_root
 from eagle_rl.runners.provenance import Provenance, slot_table_hash
 from eagle_rl.runners.records import final_checkpoint
 from eagle_rl.runners.stages import run_experiment
@@ -134,6 +135,11 @@ def test_what_has_been_judged_is_kept_whatever_comes_next(tmp_path, monkeypatch)
         main([f"A={path}", f"B={path}", "--out", str(tmp_path / "out")])
     (kept,) = (tmp_path / "out").iterdir()
     assert EvaluationResult.read(kept) == result((0.1,) * 5, ev=EvaluationCfg())
+
+
+def test_a_robot_is_known_by_the_name_in_its_file_however_it_is_given(run, capsys):
+    assert main([f"PPO={run.run_dir}", *QUICK, "--robots", str(data_root() / "cfg/robots/h1.yaml")]) == 0
+    assert "(unseen)" not in capsys.readouterr().out
 
 
 def test_an_unknown_subset_is_refused(run):

@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import pytest
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from eagle_rl.config.schema import EvaluationCfg, TaskCfg
+from eagle_rl.config.schema import CommandRangeCfg, CommandsCfg, EvaluationCfg, TaskCfg
 from eagle_rl.evaluation.evaluate import EvaluationResult, evaluate
 from eagle_rl.evaluation.metrics import RobotMetrics
+from eagle_rl.evaluation.protocol import finishing_ranges
 from eagle_rl.evaluation.reference import floors
 from tests.evaluation.fake import ScriptedEnv, idle, make_scripted_env, perfect
 
+ROOT = Path(__file__).parents[2]
+RANGES = finishing_ranges(CommandsCfg())
 FLOORS = (0.50, 0.20, 0.50, 0.15, 0.2125)
 """Mean |c_d| of U[-.6, 1.2], U[-.4, .4], U[-1, 1], U[-.3, 0], U[-.3, .5]."""
 
@@ -51,7 +55,7 @@ def constantly(*measured: float) -> Callable[[TensorDict], Tensor]:
 )
 def test_an_idle_robot_scores_the_closed_form_floors(protocol, resampling_time_s, floor):
     ev = dataclasses.replace(EV, protocol=protocol, resampling_time_s=resampling_time_s)
-    assert floors(ev)["stand still"] == pytest.approx(floor)
+    assert floors(ev, RANGES)["stand still"] == pytest.approx(floor)
     assert run(idle, ev=ev).subsets["all"].errors == pytest.approx(floor, rel=0.05)
 
 
@@ -62,7 +66,17 @@ def test_an_idle_robot_scores_the_closed_form_floors(protocol, resampling_time_s
 def test_the_best_constant_scores_its_closed_form(protocol, forward, posture):
     ev = dataclasses.replace(EV, protocol=protocol)
     metrics = run(constantly(forward, 0.0, 0.0, *posture), ev=ev)
-    assert metrics.subsets["all"].errors == pytest.approx(floors(ev)["best constant"], rel=0.05)
+    assert metrics.subsets["all"].errors == pytest.approx(floors(ev, RANGES)["best constant"], rel=0.05)
+
+
+@pytest.mark.parametrize("forward", [(0.0, 0.3), (-0.9, -0.2), (-0.1, 0.7), (0.4, 0.4)])
+def test_floors_are_of_the_ranges_in_force(forward):
+    commands = CommandsCfg(lin_vel_x=CommandRangeCfg(initial=forward, finishing=forward))
+    own, task = floors(EV, finishing_ranges(commands)), TaskCfg(commands=commands)
+    middle = constantly(sum(forward) / 2, 0.0, 0.0, -0.15, 0.1)
+    for name, policy in (("stand still", idle), ("best constant", middle)):
+        scored = evaluate(policy, make_scripted_env, ["h1"], task, EV)["h1"].subsets["all"].errors
+        assert scored == pytest.approx(own[name], rel=0.05, abs=1e-6)
 
 
 def test_a_robot_that_drifts_while_it_should_stand_is_charged_its_speed():
@@ -132,5 +146,11 @@ def test_the_task_of_an_evaluation_has_no_aids_noise_or_time_out():
 
 def test_a_result_survives_its_json():
     metrics = evaluate(perfect, make_scripted_env, ["h1", "g1"], TaskCfg(), EV)
-    result = EvaluationResult(checkpoint="0" * 64, protocol=EV, robots=metrics, seed=3, unseen=("g1",))
+    narrow = ((0.0, 0.3), *RANGES[1:])
+    result = EvaluationResult(checkpoint="0" * 64, protocol=EV, robots=metrics, seed=3, unseen=("g1",), ranges=narrow)
     assert EvaluationResult.from_json(result.to_json()) == result
+
+
+def test_a_stored_result_that_does_not_say_its_ranges_has_the_default_ones():
+    stored = [EvaluationResult.read(path) for path in (ROOT / "docs/results").rglob("*_seed*.json")]
+    assert {result.ranges for result in stored} == {RANGES}

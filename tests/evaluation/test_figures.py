@@ -16,6 +16,7 @@ from eagle_rl.evaluation import latents, plots
 from eagle_rl.evaluation.curves import RoundScores, curves_to_csv, read_curves, read_rounds
 from eagle_rl.evaluation.evaluate import EvaluationResult, evaluate
 from eagle_rl.evaluation.latents import Embeddings
+from eagle_rl.evaluation.protocol import finishing_ranges
 from eagle_rl.evaluation.response import command_responses, script
 from eagle_rl.evaluation.robustness import BODIES, DISTURBANCES, NOMINAL, sweep
 from tests.evaluation.fake import ScriptedEnv, idle, make_scripted_env, perfect
@@ -175,7 +176,7 @@ def test_figures_are_written_as_png_and_pdf(tmp_path):
     figures = {
         "latents": plots.latent_maps({"PPO": (embeddings, np.zeros((240, 2), dtype=np.float32), 0.5, 0.9)}),
         "rounds": plots.error_rounds([score]),
-        "robustness": plots.robustness([(DISTURBANCES["push"], swept)]),
+        "robustness": plots.robustness([(DISTURBANCES["push"], swept)], ev, finishing_ranges(CommandsCfg())),
     }
     assert "silhouette 0.50, linear probe 90.0%" in figures["latents"].axes[0].get_title()
     for name, figure in figures.items():

@@ -9,16 +9,19 @@ import json
 
 import pytest
 
-from eagle_rl.config.schema import EvaluationCfg, TaskCfg
+from eagle_rl.config.schema import CommandRangeCfg, CommandsCfg, EvaluationCfg, TaskCfg
 from eagle_rl.errors import ConfigError
 from eagle_rl.evaluation.evaluate import EvaluationResult, evaluate
 from eagle_rl.evaluation.metrics import SUBSETS, RobotMetrics, TrackingErrors
-from eagle_rl.evaluation.reference import PAPER, STAND_STILL
+from eagle_rl.evaluation.protocol import finishing_ranges
+from eagle_rl.evaluation.reference import PAPER
 from eagle_rl.evaluation.render import FORMATS, to_csv, to_json, to_latex, to_markdown
 from eagle_rl.evaluation.report import pooled_score, tracking_table
 from tests.evaluation.fake import idle, make_scripted_env, perfect
 
 EV = EvaluationCfg(num_envs_per_robot=16, num_steps=2)
+RANGES = finishing_ranges(CommandsCfg())
+NARROW = ((0.0, 0.3), *RANGES[1:])
 
 
 def result(
@@ -85,7 +88,14 @@ def test_every_robot_has_the_floor_rows():
     table = tracking_table({"PPO": [result((0.1,) * 5, robots=("h1", "g1"))]})
     floors = [row for row in table.rows if row.method == "stand still"]
     assert [row.robot for row in floors] == ["h1", "g1"]
-    assert tuple(cell.mean for cell in floors[0].cells) == STAND_STILL
+    assert [cell.mean for cell in floors[0].cells] == pytest.approx([0.50, 0.20, 0.50, 0.15, 0.2125])
+
+
+def test_floors_of_a_table_are_of_the_ranges_its_results_were_drawn_from():
+    narrow = dataclasses.replace(result((0.1,) * 5), ranges=NARROW)
+    assert tracking_table({"PPO": [narrow]}).rows[0].cells[0].mean == pytest.approx(0.15)
+    with pytest.raises(ConfigError, match="of the same commands, got 2 sets"):
+        tracking_table({"PPO": [narrow], "EAGLE": [result((0.1,) * 5)]})
 
 
 def test_results_of_different_protocols_are_refused():
@@ -116,7 +126,19 @@ def test_a_subset_without_steps_shows_a_dash():
     assert "| - [0.108] |" in to_markdown(table)
 
 
-def test_the_pooled_score_is_zero_for_a_perfect_and_one_for_an_idle_robot():
-    ev = EvaluationCfg(num_envs_per_robot=4000, num_steps=1)
-    scores = [pooled_score(evaluate(p, make_scripted_env, ["h1", "g1"], TaskCfg(), ev)) for p in (perfect, idle)]
-    assert scores == pytest.approx([0.0, 1.0], abs=0.02)
+@pytest.mark.parametrize(
+    ("protocol", "ranges", "idle_score"),
+    [
+        ("joint", RANGES, 1.0),
+        ("joint", NARROW, 1.0),
+        ("standing", RANGES, 1.0),
+        ("upright", RANGES, 3 / 5),
+    ],
+)
+def test_the_pooled_score_is_zero_for_a_perfect_and_one_for_an_idle_robot(protocol, ranges, idle_score):
+    """Of a command that is always zero an idle robot makes no error."""
+    ev = EvaluationCfg(num_envs_per_robot=4000, num_steps=2, resampling_time_s=0.02, protocol=protocol)
+    commands = CommandsCfg(lin_vel_x=CommandRangeCfg(initial=ranges[0], finishing=ranges[0]))
+    task = TaskCfg(commands=commands)
+    scores = [pooled_score(evaluate(p, make_scripted_env, ["h1", "g1"], task, ev), ev, ranges) for p in (perfect, idle)]
+    assert scores == pytest.approx([0.0, idle_score], abs=0.02)

@@ -67,12 +67,23 @@ def test_both_lots_of_a_real_robot_end_a_trial_alike_however_often(share):
         return size * torch.sin(torch.arange(32.0)) * obs["slot_mask"] + 0.1 * obs["history"][:, :32]
 
     trials.follow(0, trials.commands(9), partial(shake, size=0.1))
-    trials.align()
     for number in range(2):
-        costs = [trials.follow(lot, trials.commands(number), partial(shake, size=0.2))[0] for lot in range(2)]
-        assert torch.equal(*costs), f"trial {number}: nothing but the policy may differ"
-    other = trials.follow(0, trials.commands(2), partial(shake, size=0.3))[0]
-    assert not torch.equal(trials.follow(1, trials.commands(2), partial(shake, size=0.2))[0], other)
+        cost, _ = trials.compare(trials.commands(number), 2 * (partial(shake, size=0.2),))
+        assert torch.equal(*cost), f"trial {number}: nothing but the policy may differ"
+    cost, _ = trials.compare(trials.commands(2), (partial(shake, size=0.3), partial(shake, size=0.2)))
+    assert not torch.equal(*cost)
+
+
+def test_a_fall_in_one_lot_leaves_both_in_the_same_world():
+    """Who falls starts again, with friction, motors and a stance of its own."""
+    search = dataclasses.replace(SEARCH, num_pairs=2, num_steps=30, resampling_time_s=0.0, randomized_share=1.0)
+    trials = PairedTrials(dataclasses.replace(CFG, search=search), make_env_factory(RunCfg(num_threads=1)), 1)
+
+    still, flailing = ((lambda obs, size=size: size * obs["slot_mask"]) for size in (0.0, 5.0))
+    _, fell = trials.compare(trials.commands(0), (still, flailing))
+    assert fell.any(dim=1).tolist() == [False, True]
+    cost, _ = trials.compare(trials.commands(1), (still, still))
+    assert torch.equal(*cost)
 
 
 def test_a_share_of_the_pairs_is_in_the_world_of_training():

@@ -210,7 +210,6 @@ MUTANTS: tuple[Mutant, ...] = (
     # learner
     Mutant(LOSSES, "* mask).sum(dim=1) / live", "* mask).mean(dim=1)", "learner/test_losses.py"),
     Mutant(LOSSES, "mean_of_mirrored[:, perm] * sign", "mean_of_mirrored[:, perm]", "learner/test_losses.py"),
-    Mutant(LOSSES, "(teacher_std / std).square()", "(std / teacher_std).square()", "learner/test_losses.py"),
     Mutant(
         LOSSES,
         "error[:, BASE_VELOCITY_DIM:].mean(dim=1)",
@@ -230,6 +229,12 @@ MUTANTS: tuple[Mutant, ...] = (
     Mutant(CONTROL_STEP, "time_outs | (surprised & ~dones)", "time_outs", "envs/test_humanoid_env.py"),
     Mutant(
         PPO, "self.learning_rate / LEARNING_RATE_FACTOR", "self.learning_rate * LEARNING_RATE_FACTOR", LEARNER_TESTS
+    ),
+    Mutant(
+        TERMS,
+        'share["teacher_action"], share["teacher_std"], policy.mean, std',
+        'policy.mean, std, share["teacher_action"], share["teacher_std"]',
+        LEARNER_TESTS,
     ),
     Mutant(TERMS, "torch.exp(-self.decay", "torch.exp(self.decay", LEARNER_TESTS),
     Mutant(

@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from eagle_rl.algorithms.eagle_ppo import LEARNING_RATE_FACTOR
 from eagle_rl.algorithms.specialists import SpecialistBank
 from eagle_rl.cli.policy import load_policy
 from eagle_rl.errors import CheckpointError
@@ -169,17 +170,40 @@ def test_what_the_learner_sets_on_a_wrapper_reaches_the_environment(actors):
     assert not hasattr(inner, "base"), "the wrapper's own parts stay with it"
 
 
-def test_on_a_root_residuals_begin_with_its_critic_and_the_result_has_its_shape(run, tmp_path):
-    """A residual judged by a fresh critic, at the first learning rate, falls before it has learned anything."""
+def from_root(run, **plan):
+    """An experiment that forks from the run's generalist and whose critics do not learn."""
     root = run.run_dir / run.records["generalist"].checkpoint
-    cfg = toy_experiment(iterations=1, judge_envs=0, method="compass", base_env_steps=0, root=str(root))
-    frozen = replace(cfg, algo=replace(cfg.algo, critic_learning_rate=1e-12))
-    result = run_experiment(frozen, tmp_path / "run", make_toy_env, provenance=OURS)
+    cfg = toy_experiment(iterations=1, judge_envs=0, method="compass", root=str(root), **plan)
+    return root, replace(cfg, algo=replace(cfg.algo, critic_learning_rate=1e-12))
+
+
+@pytest.mark.parametrize("base_env_steps", [0, 48])
+def test_residuals_begin_with_the_demonstrators_critic_and_learning_rate_whoever_is_their_base(
+    run, tmp_path, base_env_steps
+):
+    """A residual judged by a fresh critic, at the first learning rate, falls before it has learned anything."""
+    root, cfg = from_root(run, base_env_steps=base_env_steps)
+    still = replace(cfg, algo=replace(cfg.algo, desired_kl=1e9, learning_rate_range=(1e-5, 1e9)))
+    result = run_experiment(still, tmp_path / "run", make_toy_env, provenance=OURS)
     learners = [torch.load(path, weights_only=True)["algorithm"] for path in (root, _final(result, "residual_one"))]
     for key, x in learners[0]["critic_state_dict"].items():
         torch.testing.assert_close(learners[1]["critic_state_dict"][key], x, msg=f"critic's {key} is not the root's")
+    raised = learners[0]["learning_rate"] * LEARNING_RATE_FACTOR
+    assert learners[1]["learning_rate"] == pytest.approx(raised), "raised once, from where the root's had come to"
+
+
+def test_without_a_world_model_the_result_has_the_roots_shape(run, tmp_path):
+    root, cfg = from_root(run, base_env_steps=0)
+    result = run_experiment(cfg, tmp_path / "run", make_toy_env, provenance=OURS)
     generalist, distilled = (load_actor(path)[0].architecture for path in (root, result.generalist))
-    assert distilled == generalist, "without world model the policy has the root's shape"
+    assert distilled == generalist
+
+
+def test_a_demonstrator_whose_critic_has_another_shape_is_refused_in_words(run, tmp_path):
+    _, cfg = from_root(run, base_env_steps=0)
+    cfg = replace(cfg, algo=replace(cfg.algo, network=replace(cfg.algo.network, critic_dims=(8,))))
+    with pytest.raises(CheckpointError, match="its critic has other shapes than this experiment's"):
+        run_experiment(cfg, tmp_path / "run", make_toy_env, provenance=OURS)
 
 
 def _final(result, name):

@@ -144,7 +144,7 @@ def test_compass_imitates_then_specialises_by_residuals_then_distils():
     stages = {stage.name: stage for stage in plan(method="compass", base_env_steps=5, root="model.pt")}
     base, residual, distill = (stages[f"compass/{name}"] for name in ("base", "residual_g1", "distill"))
     assert base.inputs == ("root",)
-    assert residual.inputs == ("compass/base",)
+    assert residual.inputs == ("compass/base", "root"), "the base imitates and has no critic"
     assert set(distill.inputs) == {"compass/base", *(f"compass/residual_{r}" for r in ExperimentCfg(name="x").robots)}
     assert (base.init, residual.init, distill.init) == (None, None, "compass/base")
     assert (base.demonstrations, residual.demonstrations, distill.demonstrations) == (True, False, True)

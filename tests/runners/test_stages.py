@@ -18,7 +18,7 @@ from eagle_rl.runners.claims import Claim, ClaimLostError
 from eagle_rl.runners.plan import plan_stages
 from eagle_rl.runners.records import final_checkpoint, read_record, stage_dir
 from eagle_rl.runners.stages import run_experiment
-from eagle_rl.runners.training import train
+from eagle_rl.runners.training import stage_cfg, train
 from tests.runners.toy_run import ENVS, STEPS, JudgedToyEnv, make_toy_env, parameters, toy_experiment, toy_job
 
 
@@ -38,6 +38,13 @@ def test_one_round_trains_generalist_specialists_and_distillation(finished):
     ]
     assert all(record.state == "done" for record in finished.records.values())
     assert finished.generalist.parent.parent == stage_dir(finished.run_dir, "round1/distill")
+
+
+def test_only_imitation_can_do_without_ppos_loss():
+    cfg = toy_experiment()
+    cfg = replace(cfg, algo=replace(cfg.algo, use_ppo_loss=False))
+    with_ppo = {stage.kind: stage_cfg(cfg, stage).algo.use_ppo_loss for stage in plan_stages(cfg)}
+    assert with_ppo == {"generalist": True, "specialist": True, "distill": False}
 
 
 def test_costs_are_counted_per_stage(finished):

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -14,10 +16,11 @@ from eagle_rl.errors import CheckpointError
 from eagle_rl.runners.checkpoint import load_actor, load_correction, publish_policy, read_manifest
 from eagle_rl.runners.judged import judged_results, training_steps
 from eagle_rl.runners.plan import plan_stages
+from eagle_rl.runners.provenance import Provenance
 from eagle_rl.runners.records import final_checkpoint
 from eagle_rl.runners.stages import run_experiment
 from eagle_rl.runners.training import train
-from tests.runners.test_searching import make_still_env
+from tests.runners.test_searching import StillToyEnv, make_still_env
 from tests.runners.toy_run import make_toy_env, refuse, toy_experiment, toy_job
 
 
@@ -61,6 +64,19 @@ def test_a_run_is_complete_without_its_teachers_files_and_counts_none_of_their_s
     steps = 2 * cfg.num_envs * cfg.algo.num_steps_per_env
     assert result.env_steps == training_steps(result.generalist) == steps, "the generalist and its distillation"
     assert "given specialist, round 1" in judged_results(result.run_dir, plan_stages(cfg))
+
+
+def test_a_robot_given_by_a_path_keeps_its_hash_and_is_taught_by_a_specialist_of_its_name(specialists, tmp_path):
+    cfg = taught_by(corrected(specialists, "one"), "generalist", "generalist")
+    cfg = replace(cfg, robots=("my/one.yaml", "two", "three"))
+
+    def make_env(robots: Sequence[str], *rest: Any) -> StillToyEnv:
+        return make_still_env([Path(robot).stem for robot in robots], *rest)
+
+    hashes = {"one": "aa", "two": "bb", "three": "cc"}
+    result = run_experiment(cfg, tmp_path / "run", make_env, provenance=Provenance(robots=hashes))
+    manifests = [read_manifest(final_checkpoint(result.run_dir, name)) for name in ("round1/teacher_one", "generalist")]
+    assert [manifest["robot_hashes"] for manifest in manifests] == [{"one": "aa"}, hashes]
 
 
 def test_the_second_round_trains_specialists_of_its_own(specialists, tmp_path):

@@ -90,6 +90,7 @@ def toy_job(cfg: ExperimentCfg, stage: Stage, folder: Path, make_env: MakeEnv = 
         teachers=(),
         start=None,
         base=None,
+        critic=None,
         make_env=make_env,
         provenance=Provenance(),
         check_claim=lambda: None,
