@@ -24,8 +24,8 @@ Made from the docstrings of `eagle_rl/config/schema.py` and `task_schema.py` by
 
 A key is written as `key=value` behind an experiment's name on the command line, or in an experiment's YAML, where dots
 are levels. Defaults here are the schema's: files in `cfg/task`, `cfg/algo` and `cfg/experiment` say otherwise for many
-keys, and `eagle train EXPERIMENT --show` prints what holds. Sources: *paper* is the EAGLE paper, *HugWBC* what it builds
-on, *ours* our choice, mostly with its reason in [decisions.md](decisions.md). `[-]` is a number without unit. An
+keys, and `eagle train EXPERIMENT --show` prints what holds. Sources: *paper* is the EAGLE paper, *HugWBC* what it is
+built on, *ours* our choice, mostly with its reason in [decisions.md](decisions.md). `[-]` is a number without unit. An
 environment step is one robot's 50 Hz control step.
 """
 
