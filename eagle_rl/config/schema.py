@@ -64,10 +64,15 @@ class NetworkCfg:
     embedding_dim: int = 32
     """Size of e(s_t) [-]."""
     encoder_dims: tuple[int, ...] = (256, 128)
+    """Hidden layers of the history's encoder."""
     estimator_dims: tuple[int, ...] = (64, 32)
+    """Hidden layers of the estimator of base velocity and o_ea."""
     actor_dims: tuple[int, ...] = (256, 128, 64)
+    """Hidden layers of the policy head."""
     critic_dims: tuple[int, ...] = (512, 256, 128)
+    """Hidden layers of the critic."""
     activation: Literal["elu", "relu", "tanh"] = "elu"
+    """After every hidden layer."""
     init_std: float = 0.7
     """Initial standard deviation of every action [-] (ours)."""
     std_range: Range = (0.1, 1.2)
@@ -84,20 +89,31 @@ class AlgoCfg:
     num_steps_per_env: int = 24
     """Control steps per environment and iteration (HugWBC 7)."""
     num_learning_epochs: int = 4
+    """Passes over the data of an iteration (ours; HugWBC 5)."""
     num_mini_batches: int = 4
+    """Minibatches in a pass (HugWBC 7)."""
     clip_param: float = 0.2
+    """PPO's bound on the change of a probability ratio [-] (HugWBC 7)."""
     gamma: float = 0.99
+    """Discount per control step [-] (HugWBC 7)."""
     lam: float = 0.95
+    """lambda of the generalised advantage estimate [-] (HugWBC 7)."""
     learning_rate: float = 1e-3
+    """Of the actor at the start; ``desired_kl`` moves it (HugWBC 7)."""
     learning_rate_range: Range = (1e-5, 2e-3)
+    """Bounds of the actor's learning rate (ours; HugWBC to 1e-2)."""
     desired_kl: float = 0.01
     """KL target of the actor's learning rate, which moves once an iteration (ours: per minibatch it bounced)."""
     critic_learning_rate: float = 5e-4
     """Of the critic, fixed (ours): the KL says nothing about the critic, which starved at the actor's 4e-5."""
     entropy_coef: float = 0.002
+    """Weight of the entropy bonus (ours; HugWBC 0.01)."""
     value_loss_coef: float = 1.0
+    """Weight of the critic's loss (HugWBC 7)."""
     use_clipped_value_loss: bool = False
+    """Clip the change of values as that of ratios (ours; HugWBC does)."""
     max_grad_norm: float = 1.0
+    """Bound on the norm of the gradient (HugWBC 7)."""
     estimation_coef: float = 2.0
     """Weight of the estimator's loss on base velocity and o_ea, each a mean over its own dimensions (HugWBC 6)."""
     mirror_coef: float = 0.5
@@ -129,6 +145,7 @@ class PlanCfg:
     """What an experiment trains, in environment steps (one robot, one 50 Hz control step)."""
 
     method: Literal["ppo", "eagle", "kickstarting", "compass"] = "ppo"
+    """How, the rows of the paper's table; ``ppo`` has a generalist and no rounds."""
     generalist_env_steps: int = 20_000_000
     """Budget of the root policy."""
     specialist_env_steps: int = 0
@@ -221,7 +238,9 @@ class EvaluationCfg:
     """Protocol of the tracking table (paper, Eq. E_d)."""
 
     num_envs_per_robot: int = 2048
+    """Environments a robot (paper)."""
     num_steps: int = 1000
+    """Control steps, 20 s (paper)."""
     protocol: Literal["single", "joint", "upright", "standing"] = "joint"
     """``single`` varies one command and keeps the others at zero; ``joint`` samples all five; ``upright`` samples the
     velocities and keeps height and pitch at zero, as a robot is driven that has no others; ``standing`` samples
@@ -233,8 +252,11 @@ class EvaluationCfg:
     noise: bool = False
     """Sensor noise as in training."""
     seed: int = 1234
+    """Of commands, resets and randomization."""
     physics_dt: float = 0.005
+    """Physics step [s] (ours); finer than in training."""
     decimation: int = 4
+    """Physics steps per control step [-]; physics_dt * decimation must be 0.02 s."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -260,6 +282,7 @@ class RunCfg:
     save_interval: int = 50
     """Iterations between checkpoints."""
     keep_checkpoints: int = 3
+    """How many of the newest are kept; the best and the ends of stages always are."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -267,11 +290,15 @@ class ExperimentCfg:
     """One experiment: a row of the paper's tables, or one of ours."""
 
     name: str
+    """Name of its folder in ``logs``; that of the file where the file says none."""
     description: str = ""
+    """One sentence for people."""
     robots: tuple[str, ...] = ("h1", "g1", "t1", "n1", "adam")
+    """Names in ``cfg/robots``, or YAML files of robots."""
     num_envs: int = 320
     """Environments over all robots together [-]; a remainder is spread over the first robots."""
     seed: int = 1
+    """Of everything drawn in training."""
     task: TaskCfg = field(default_factory=TaskCfg)
     algo: AlgoCfg = field(default_factory=AlgoCfg)
     plan: PlanCfg = field(default_factory=PlanCfg)

@@ -92,7 +92,9 @@ class CommandCurriculumCfg:
     enabled: bool = True
     """Off: commands come from the finishing ranges at once."""
     num_bins_lin_vel_x: int = 12
+    """Bins of v_x over its finishing range [-] (ours)."""
     num_bins_ang_vel_z: int = 8
+    """Bins of omega over its finishing range [-] (ours)."""
     neighbour_radius: float = 0.25
     """Bins whose centre is this near in both v_x [m/s] and omega [rad/s] gain weight on success."""
     weight_step: float = 0.2
@@ -100,8 +102,11 @@ class CommandCurriculumCfg:
     lin_vel_threshold: float = 0.8
     """Success needs this share of the maximum of the window's mean linear-velocity reward [-]."""
     ang_vel_threshold: float = 0.4
+    """... of the yaw rate's reward [-] (HugWBC 2)."""
     contact_force_threshold: float = 0.8
+    """... of 1 minus the mean penalty of both feet's contact force [-] (HugWBC 2)."""
     contact_vel_threshold: float = 0.8
+    """... of 1 minus that of their contact velocity [-] (HugWBC 2)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,10 +114,15 @@ class CommandsCfg:
     """The five commands (paper, Tab. command ranges; SI units)."""
 
     lin_vel_x: CommandRangeCfg = CommandRangeCfg(initial=(-0.3, 0.6), finishing=(-0.6, 1.2))
+    """v_x, forward in the base frame [m/s] (paper)."""
     lin_vel_y: CommandRangeCfg = CommandRangeCfg(initial=(-0.5, 0.5), finishing=(-0.4, 0.4))
+    """v_y, left in the base frame [m/s] (paper)."""
     ang_vel_z: CommandRangeCfg = CommandRangeCfg(initial=(-0.5, 0.5), finishing=(-1.0, 1.0))
+    """omega, left turn [rad/s] (paper)."""
     base_height: CommandRangeCfg = CommandRangeCfg(initial=(-0.3, 0.0), finishing=(-0.3, 0.0))
+    """h, from the robot's nominal height [m] (paper)."""
     body_pitch: CommandRangeCfg = CommandRangeCfg(initial=(-0.3, 0.5), finishing=(-0.3, 0.5))
+    """p, forward [rad] (paper)."""
     resampling_time_s: float = 10.0
     """Time between draws [s]; commands are also drawn at reset (HugWBC 2)."""
     redraw_after_fall: bool = True
@@ -210,7 +220,8 @@ class ObservationsCfg:
 class RewardWeightsCfg:
     """Coefficients of the paper's reward table, then the terms it inherits without printing them (HugWBC 4).
 
-    Each is multiplied by the control step, 0.02 s (HugWBC 0, item 1).
+    What a weight multiplies is the function of its name in ``envs/mdp/rewards.py``, with its unit. The product is
+    multiplied by the control step, 0.02 s (HugWBC 0, item 1).
     """
 
     lin_vel_tracking: float = 2.0

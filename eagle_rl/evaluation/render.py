@@ -60,7 +60,7 @@ def to_markdown(table: Table) -> str:
         *(f"{s} [{u}]" for s, u in zip(SYMBOLS, UNITS, strict=True)),
         "survival",
         "seeds",
-        "M steps",
+        "M steps of the run",
     ]
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     best = _best(table)
@@ -81,7 +81,8 @@ def to_markdown(table: Table) -> str:
     hashes = [f"- {method}: {', '.join(h[:12] for h in hashes)}" for method, hashes in table.checkpoints.items()]
     note = (
         "Bold: the lowest of a robot's judged methods. In brackets: the paper's number. "
-        "± is the standard deviation over training seeds. M steps: millions of environment steps a seed has cost. "
+        "± is the standard deviation over training seeds. M steps of the run: millions of environment steps of the run "
+        "that made a seed's policy; what a root from elsewhere had cost before is not counted. "
         "Unseen: the method was not trained on this robot."
     )
     return "\n".join([*lines, "", table.caption, note, "", "Checkpoints (sha256):", "", *hashes, ""])

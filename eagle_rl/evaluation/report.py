@@ -41,7 +41,7 @@ class Row:
     seeds: tuple[int, ...] = ()
     """Training seeds; empty for a reference row."""
     env_steps: float | None = None
-    """Mean cost of a seed, if known."""
+    """Mean cost of a seed's run, if known."""
 
 
 @dataclass(frozen=True, kw_only=True)

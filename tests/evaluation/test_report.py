@@ -49,6 +49,12 @@ def test_seeds_become_mean_and_standard_deviation():
     assert row.env_steps == 3_000_000
 
 
+def test_steps_are_labelled_as_those_of_the_run_alone():
+    text = to_markdown(tracking_table({"EAGLE": [result((0.1,) * 5)]}))
+    assert text.splitlines()[0].endswith("| M steps of the run |")
+    assert "a root from elsewhere had cost before is not counted" in text
+
+
 def test_the_papers_number_stands_beside_ours_only_for_its_methods_and_robots():
     table = tracking_table({"EAGLE": [result((0.1,) * 5, robots=("h1", "mine"))], "mine": [result((0.1,) * 5)]})
     papers = {(row.robot, row.method): row.cells[0].paper for row in table.rows}
