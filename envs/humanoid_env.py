@@ -207,7 +207,8 @@ class HumanoidEnv(ControlStep, VecEnv):
     def reset(self) -> None:
         """Start new episodes everywhere; random streams go on."""
         self._forget()
-        self.pool.staged, self.history.frames = self.pool.staged.clone(), self.history.frames.clone()  # as handed out
+        self.pool.staged = self.pool.staged.clone()  # what was handed out keeps its values
+        self.history.frames = self.history.frames.clone()
         self._reset(self._all, torch.zeros_like(self._all, dtype=torch.bool))
 
     def get_observations(self) -> TensorDict:
