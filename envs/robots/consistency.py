@@ -7,9 +7,9 @@ from collections.abc import Collection
 
 import numpy as np
 
-from .slots import AXES, LEG_AND_WAIST_SLOTS, MIRROR_PERMUTATION, MIRROR_SIGN, SLOT_NAMES, slot_frame
+from .slots import AXES, LEG_AND_WAIST_SLOTS, LEG_PITCH_SLOTS, MIRROR_PERMUTATION, MIRROR_SIGN, SLOT_NAMES, slot_frame
 from .spec import FEET, Array, RobotSpec
-from .tree import Body, Tree
+from .tree import Body, Pose, Tree
 
 HEIGHT_TOLERANCE = 0.01
 """Most that ``nominal_height_m`` may differ from forward kinematics [m]."""
@@ -34,6 +34,9 @@ def consistency_faults(spec: RobotSpec, tree: Tree) -> list[str]:
         )
         if not lower <= angle <= upper
     ]
+    absent = [SLOT_NAMES[slot] for slot in LEG_PITCH_SLOTS if not spec.slot_mask[slot]]
+    if absent:
+        faults.append(f"no joint in slots {', '.join(absent)}; legs must bend at hip, knee and ankle")
     faults += direction_faults(spec, tree, LEG_AND_WAIST_SLOTS)
     faults += _swapped_sides(spec, tree)
     faults += _asymmetries(spec)
@@ -52,7 +55,8 @@ def direction_faults(spec: RobotSpec, tree: Tree, slots: Collection[int]) -> lis
 
     Legs and waist must, or a policy means another motion; arms and head may be built otherwise.
     """
-    return [*_wrong_zeros(spec, tree, slots), *_wrong_axes(spec, tree, slots)]
+    standing = tree.forward(spec.zero_offsets)
+    return [*_wrong_zeros(spec, tree, standing, slots), *_wrong_axes(spec, _turns(spec, tree, standing), slots)]
 
 
 def default_height(spec: RobotSpec, tree: Tree) -> float:
@@ -71,14 +75,13 @@ def shapeless(body: Body, role: str, consequence: str) -> str:
     )
 
 
-def _turns(spec: RobotSpec, tree: Tree) -> Array:
+def _turns(spec: RobotSpec, tree: Tree, standing: dict[str, Pose]) -> Array:
     """Axes, in the base frame at canonical zero, about which positive slots turn what is farther from the pelvis.
 
     Shape (n, 3), unit length. Where the pelvis hangs on the torso, the waist turns the near part against it.
     """
-    poses = tree.forward(spec.zero_offsets)
     names = [body.name for body in tree.bodies]
-    axes = [poses[name].rot @ joint.axis for name, joint in zip(names[1:], tree.joints, strict=True)]
+    axes = [standing[name].rot @ joint.axis for name, joint in zip(names[1:], tree.joints, strict=True)]
     turns = spec.signs[:, None] * np.reshape(axes, (-1, 3))
     index = names.index(spec.link_roles["pelvis"])
     while index > 0:
@@ -87,9 +90,9 @@ def _turns(spec: RobotSpec, tree: Tree) -> Array:
     return turns
 
 
-def _wrong_axes(spec: RobotSpec, tree: Tree, slots: Collection[int]) -> list[str]:
+def _wrong_axes(spec: RobotSpec, turns: Array, slots: Collection[int]) -> list[str]:
     faults = []
-    for joint, slot, sign, turn in zip(spec.joint_names, spec.slots, spec.signs, _turns(spec, tree), strict=True):
+    for joint, slot, sign, turn in zip(spec.joint_names, spec.slots, spec.signs, turns, strict=True):
         name = SLOT_NAMES[slot]
         along = slot_frame(name) @ turn
         own, nearest = AXES.index(name.rpartition("_")[2]), int(np.argmax(np.abs(along)))
@@ -105,12 +108,11 @@ def _wrong_axes(spec: RobotSpec, tree: Tree, slots: Collection[int]) -> list[str
     return faults
 
 
-def _wrong_zeros(spec: RobotSpec, tree: Tree, slots: Collection[int]) -> list[str]:
-    poses = tree.forward(spec.zero_offsets)
-    at = {SLOT_NAMES[slot]: poses[body.name].pos for slot, body in zip(spec.slots, tree.bodies[1:], strict=True)}
+def _wrong_zeros(spec: RobotSpec, tree: Tree, standing: dict[str, Pose], slots: Collection[int]) -> list[str]:
+    at = {SLOT_NAMES[slot]: standing[body.name].pos for slot, body in zip(spec.slots, tree.bodies[1:], strict=True)}
     for side in FEET:
         hand = tree.locate(spec.link_roles[f"{side}_hand"])[0]
-        at[f"{side}_hand"] = poses[hand.name].apply(hand.inertial.com)
+        at[f"{side}_hand"] = standing[hand.name].apply(hand.inertial.com)
     wanted = {SLOT_NAMES[slot] for slot in slots}
     faults = []
     for limb, ends in LIMBS.items():

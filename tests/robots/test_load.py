@@ -238,6 +238,14 @@ def test_a_loop_beside_the_base_is_refused(tmp_path: Path) -> None:
     assert "['p', 'q'] form a loop" in _refusal(tmp_path, urdf=biped_urdf().replace("</robot>", loop + "</robot>"))
 
 
+def test_legs_that_cannot_bend_at_the_ankle_are_refused(tmp_path: Path) -> None:
+    urdf, data = biped_urdf(), biped_data()
+    for side in ("left", "right"):
+        del data["joints"][f"{side}_ankle_pitch"]
+        urdf = urdf.replace(f'"{side}_ankle_pitch" type="revolute"', f'"{side}_ankle_pitch" type="fixed"')
+    assert "no joint in slots right_ankle_pitch, left_ankle_pitch; legs" in _refusal(tmp_path, urdf, data)
+
+
 def test_a_foot_that_can_touch_nothing_is_refused(tmp_path: Path) -> None:
     box = '<box size="0.2 0.08 0.04"/>'
     message = _refusal(tmp_path, urdf=biped_urdf().replace(box, '<mesh filename="foot.stl"/>'))
