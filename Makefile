@@ -6,7 +6,7 @@
 #   make results   tables and figures of docs/results from the published policy (about 25 minutes on two idle cores)
 #   make bench     throughput           make package   sdist and wheel, installed and tried in an empty folder
 #   make lowest    all tests with the lowest versions setup.py allows, in an environment of its own (.venv-lowest)
-#   make mutants   break the mathematics in 141 places, one at a time: do the tests notice? (about ten minutes)
+#   make mutants   break the mathematics in 143 places, one at a time: do the tests notice? (about ten minutes)
 #   make clean     remove what was built (never logs/)
 #
 # PYTHON names the interpreter (3.10 to 3.13). CONSTRAINTS= installs the newest allowed packages instead of the tested
