@@ -23,7 +23,7 @@ class BuildWithData(build_py):
         for name in DATA_FOLDERS:
             target = Path(self.build_lib) / "eagle_rl" / "data" / name
             shutil.rmtree(target, ignore_errors=True)
-            shutil.copytree(ROOT / name, target, ignore=shutil.ignore_patterns("root"))  # to train on from: 10 MB
+            shutil.copytree(ROOT / name, target, ignore=shutil.ignore_patterns("learner"))  # to train on from: 36 MB
 
 
 def version() -> str:

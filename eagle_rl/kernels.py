@@ -7,9 +7,6 @@ arithmetic may matter: it must not branch on values, count in Python, or draw co
 
 from __future__ import annotations
 
-import os
-import shutil
-import sys
 import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -18,24 +15,13 @@ import torch
 from torch import Tensor, fx
 
 from eagle_rl.errors import CompileError
+from eagle_rl.machine import find_compiler
 
 Kernel = Callable[..., Sequence[Tensor]]
 """Takes tensors of just the shapes, types and strides it was made for."""
 
 _TRUSTING = {"size_asserts": False, "alignment_asserts": False, "assert_indirect_indexing": False}
 """Whoever calls a kernel sees to it that its inputs are as promised; to check them takes a tenth of a small one."""
-
-
-def find_compiler() -> str:
-    """The C++ compiler that TorchInductor will take.
-
-    Raises:
-        CompileError: it is not there.
-    """
-    name = os.getenv("CXX", "clang++" if sys.platform == "darwin" else "g++")
-    if shutil.which(name) is None:
-        raise CompileError(f"There is no C++ compiler {name!r}. On Debian: apt install g++; or name another in CXX.")
-    return name
 
 
 def record(function: Callable[..., list[Tensor]], inputs: Sequence[Tensor]) -> fx.GraphModule:

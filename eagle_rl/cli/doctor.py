@@ -1,10 +1,16 @@
-"""``eagle doctor``: is this installation complete, and can this machine do what will be asked of it?"""
+"""``eagle doctor``: is this installation complete, and can this machine do what will be asked of it?
+
+What a check needs beyond the standard library is imported inside it: doctor must run where everything is missing.
+"""
 
 from __future__ import annotations
 
 import argparse
+import ast
+import importlib.util
 import os
 import platform
+import re
 import subprocess
 import sys
 import tempfile
@@ -13,12 +19,8 @@ from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from typing import NamedTuple
 
-from packaging.requirements import Requirement
-
-from eagle_rl.config.compose import known_names
-from eagle_rl.config.load import load_experiment
 from eagle_rl.errors import CompileError, EagleError
-from eagle_rl.machine import usable_cores
+from eagle_rl.machine import find_compiler, usable_cores
 from eagle_rl.paths import data_root
 
 _RENDER = """
@@ -40,17 +42,41 @@ class Finding(NamedTuple):
 def check_packages() -> list[Finding]:
     """Each required package, its version, and whether it is in the range that setup.py allows."""
     try:
-        needed = [Requirement(text) for text in requires("eagle-rl") or []]
+        return _packages(requires("eagle-rl") or [])
     except PackageNotFoundError:
-        return [Finding("eagle-rl", "FAIL", "not installed; run make setup, or pip install -e .")]
+        advice = f"not installed in {sys.executable}; run make setup, then source .venv/bin/activate"
+        return [Finding("eagle-rl", "FAIL", advice), *_packages(_requirements_of_checkout())]
+
+
+def _requirements_of_checkout() -> list[str]:
+    """What setup.py asks for; nothing where there is none."""
+    setup = data_root() / "setup.py"
+    nodes = ast.walk(ast.parse(setup.read_text(encoding="utf-8"))) if setup.is_file() else ()
+    asked = (node.value for node in nodes if isinstance(node, ast.keyword) and node.arg == "install_requires")
+    return [text for value in asked for text in ast.literal_eval(value)]
+
+
+def _packages(needed: Sequence[str]) -> list[Finding]:
     findings = []
-    for requirement in needed:
-        if requirement.marker is None or requirement.marker.evaluate({"extra": ""}):
-            found = installed_version(requirement.name)
-            good = found != "missing" and requirement.specifier.contains(found, prereleases=True)
-            wanted = "" if good else f", needs {requirement.specifier}; run make setup"
-            findings.append(Finding(requirement.name, "ok" if good else "FAIL", found + wanted))
+    for text in needed:
+        name = re.split(r"[ <>=!~;]", text, maxsplit=1)[0]
+        wanted = text.removeprefix(name)
+        if ";" in wanted:  # of an extra
+            continue
+        found = installed_version(name)
+        good = found != "missing" and _allows(wanted, found)
+        advice = "" if good else f", needs {wanted}; run make setup"
+        findings.append(Finding(name, "ok" if good else "FAIL", found + advice))
     return findings
+
+
+def _allows(wanted: str, found: str) -> bool:
+    """Whether a version is in a range, as far as it can be told: without packaging, which is reported itself, it is."""
+    try:
+        from packaging.specifiers import SpecifierSet
+    except ModuleNotFoundError:
+        return True
+    return SpecifierSet(wanted).contains(found, prereleases=True)
 
 
 def installed_version(package: str) -> str:
@@ -76,6 +102,8 @@ def check_machine() -> list[Finding]:
 
 def check_data() -> list[Finding]:
     """Whether every shipped robot and experiment loads."""
+    from eagle_rl.config.compose import known_names
+    from eagle_rl.config.load import load_experiment
     from envs.robots.load import load_robot
 
     findings = []
@@ -97,8 +125,6 @@ def _fault(load: Callable[[str], object], name: str) -> str:
 
 def check_compiler() -> list[Finding]:
     """Whether steps can be compiled; long training is a little quicker with."""
-    from eagle_rl.kernels import find_compiler
-
     try:
         return [Finding("compiler", "ok", find_compiler())]
     except CompileError as error:
@@ -107,6 +133,8 @@ def check_compiler() -> list[Finding]:
 
 def check_graphics() -> list[Finding]:
     """Whether pictures can be rendered without a display; tried in another process, for a bad driver may kill it."""
+    if importlib.util.find_spec("mujoco") is None:
+        raise ModuleNotFoundError(name="mujoco")
     backend = os.environ.get("MUJOCO_GL", "egl")
     command = [sys.executable, "-c", _RENDER]
     try:
@@ -129,12 +157,19 @@ def check_folder() -> list[Finding]:
         return [Finding("folder", "warn", f"{Path.cwd()}: {error.strerror}; train with --out DIR")]
 
 
+def _findings(check: Callable[[], list[Finding]]) -> list[Finding]:
+    try:
+        return check()
+    except ModuleNotFoundError as error:
+        return [Finding(check.__name__.removeprefix("check_"), "FAIL", f"cannot be checked without {error.name}")]
+
+
 def main(argv: Sequence[str]) -> int:
     """Run ``eagle doctor``; 2 if something is missing without which nothing works."""
     argparse.ArgumentParser(prog="eagle doctor", description=__doc__).parse_args(argv)
     findings: list[Finding] = []
     for check in (check_machine, check_packages, check_data, check_compiler, check_graphics, check_folder):
-        findings += check()
+        findings += _findings(check)
     for finding in findings:
         print(f"{finding.state:<4}  {finding.name:<16} {finding.detail}")
     failed = sum(finding.state == "FAIL" for finding in findings)

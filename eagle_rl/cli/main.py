@@ -61,6 +61,16 @@ def guarded(action: Callable[[], int]) -> int:
     except BrokenPipeError:  # the reader, such as head, has left
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except ModuleNotFoundError as error:
+        package = (error.name or "").partition(".")[0]
+        if package in ("", "eagle_rl", "envs"):  # a fault of ours
+            raise
+        print(
+            f"error: {package} is not installed in {sys.executable}. Run make setup, then source .venv/bin/activate; "
+            "eagle doctor lists what is missing.",
+            file=sys.stderr,
+        )
+        return EagleError.exit_code
     except OSError as error:
         if error.strerror is None:
             raise

@@ -11,10 +11,11 @@ import numpy as np
 from eagle_rl.config.schema import SimCfg
 
 from .asymmetry import asymmetries
+from .consistency import direction_faults, shapeless
 from .load import load_robot
 from .model import KEYFRAME, build_model
 from .sensors import FLOOR
-from .slots import SLOT_NAMES
+from .slots import HEAD_AND_ARM_SLOTS, SLOT_NAMES
 from .spec import COLLISION_LINKS, FALL_LINKS, FEET, Array, RobotSpec
 from .tree import Body, Pose, Tree
 from .urdf import read_urdf
@@ -46,6 +47,7 @@ def check_robot(name_or_path: str | Path) -> list[str]:
     mujoco.mj_resetDataKeyframe(model, data, model.key(KEYFRAME).id)
     mujoco.mj_forward(model, data)
     return [
+        *direction_faults(spec, tree, HEAD_AND_ARM_SLOTS),
         *_sole_findings(spec, tree),
         *_shape_findings(spec, tree),
         *_contact_findings(model, data),
@@ -94,8 +96,8 @@ def _sole_findings(spec: RobotSpec, tree: Tree) -> list[str]:
 
 
 def _lowest_point(body: Body) -> float:
-    """Lowest z of a body's collision shapes in its own frame [m]; infinite without shapes."""
-    return min((_bottom(s.kind, s.size, s.pose) for s in body.shapes if not s.visual), default=math.inf)
+    """Lowest z of a body's collision shapes in its own frame [m]."""
+    return min(_bottom(s.kind, s.size, s.pose) for s in body.shapes if not s.visual)
 
 
 def _bottom(kind: str, size: tuple[float, ...], pose: Pose) -> float:
@@ -107,12 +109,8 @@ def _bottom(kind: str, size: tuple[float, ...], pose: Pose) -> float:
 
 
 def _shape_findings(spec: RobotSpec, tree: Tree) -> list[str]:
-    roles = dict.fromkeys((*COLLISION_LINKS, *FALL_LINKS, *(f"{side}_foot" for side in FEET)))
-    return [
-        f"{spec.link_roles[role]}, the {role}, has no collision shape, so it can touch nothing"
-        for role in roles
-        if all(shape.visual for shape in tree.locate(spec.link_roles[role])[0].shapes)
-    ]
+    bodies = {role: tree.locate(spec.link_roles[role])[0] for role in dict.fromkeys((*COLLISION_LINKS, *FALL_LINKS))}
+    return [shapeless(body, role, "it can touch nothing") for role, body in bodies.items() if not body.can_touch]
 
 
 def _contact_findings(model: mujoco.MjModel, data: mujoco.MjData) -> list[str]:

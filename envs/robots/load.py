@@ -14,7 +14,8 @@ from eagle_rl.config.yaml_file import read_yaml, to_plain
 from eagle_rl.errors import ConfigError, RobotError, did_you_mean
 from eagle_rl.paths import data_root
 
-from .slots import MIRROR_PERMUTATION, MIRROR_SIGN, SLOT_INDEX, SLOT_NAMES
+from .consistency import consistency_faults
+from .slots import SLOT_INDEX, SLOT_NAMES
 from .spec import COLLISION_LINKS, FALL_LINKS, FEET, Array, RobotSpec
 from .tree import Tree
 from .urdf import MAX_VALUE, as_sentence, read_urdf
@@ -44,9 +45,6 @@ JOINT_NUMBERS = {
     "armature_kgm2": 0.0,
 }
 """Numbers of each joint, with their lower bounds."""
-
-HEIGHT_TOLERANCE = 0.01
-"""Most that ``nominal_height_m`` may differ from forward kinematics [m]."""
 
 
 def robot_names() -> tuple[str, ...]:
@@ -258,60 +256,3 @@ class _Draft:
         if numbers[0] not in (1.0, -1.0):
             self.faults.append(f"{where}.sign is {numbers[0]:g}, expected 1 or -1")
         return SLOT_INDEX.get(str(slot), 0), numbers
-
-
-def consistency_faults(spec: RobotSpec, tree: Tree) -> list[str]:
-    """Faults that no single number shows: default pose, left/right symmetry, nominal height."""
-    faults = [
-        f"joints.{name}.default_angle_rad is {angle:g}, outside its limits [{lower:g}, {upper:g}]"
-        for name, angle, lower, upper in zip(
-            spec.joint_names, spec.default_joint_pos, spec.joint_lower, spec.joint_upper, strict=True
-        )
-        if not lower <= angle <= upper
-    ]
-    faults += _swapped_sides(spec, tree)
-    faults += _asymmetries(spec)
-    height = default_height(spec, tree)
-    if abs(height - spec.nominal_height) > HEIGHT_TOLERANCE:
-        faults.append(
-            f"nominal_height_m is {spec.nominal_height:g}, but in the default pose the base is {height:.4f} m above "
-            "the lower sole; correct it, or default_angle_rad, or sole_centre_m"
-        )
-    return faults
-
-
-def default_height(spec: RobotSpec, tree: Tree) -> float:
-    """Height of the base above the lower sole centre in the default pose, base upright [m]."""
-    poses = tree.forward(spec.default_joint_pos)
-    feet = [poses[spec.link_roles[f"{side}_foot"]] for side in FEET]
-    return -min(float(foot.apply(sole)[2]) for foot, sole in zip(feet, spec.sole_offsets, strict=True))
-
-
-def _swapped_sides(spec: RobotSpec, tree: Tree) -> list[str]:
-    """Roles of which the left link is not to the left of the right one: all that is left or right would be mixed up."""
-    poses, links = tree.forward(spec.default_joint_pos), spec.link_roles
-    points = {role: np.zeros(3) for role in links} | {
-        f"{side}_foot": sole for side, sole in zip(FEET, spec.sole_offsets, strict=True)
-    }
-    across = {role: float(poses[link].apply(points[role])[1]) for role, link in links.items()}
-    parts = [role.removeprefix("left_") for role in links if role.startswith("left_")]
-    return [
-        f"roles: left_{part} is at y = {across[f'left_{part}']:.3f} m in the default pose and right_{part} at "
-        f"{across[f'right_{part}']:.3f} m, expected the left one at the larger y; are they swapped?"
-        for part in parts
-        if across[f"left_{part}"] <= across[f"right_{part}"]
-    ]
-
-
-def _asymmetries(spec: RobotSpec) -> list[str]:
-    mask = spec.slot_mask
-    unpaired = [SLOT_NAMES[slot] for slot in np.flatnonzero(mask & ~mask[MIRROR_PERMUTATION])]
-    if unpaired:
-        return [f"slots without their left/right partner: {', '.join(unpaired)}"]
-    canonical = spec.to_canonical(spec.default_joint_pos)
-    mirrored = MIRROR_SIGN * canonical[MIRROR_PERMUTATION]
-    return [
-        f"default pose is not left/right symmetric at {SLOT_NAMES[slot]}: canonical {canonical[slot]:g} rad, "
-        f"mirror image {mirrored[slot]:g}"
-        for slot in np.flatnonzero(np.abs(canonical - mirrored) > 1e-6)
-    ]

@@ -7,6 +7,7 @@ with hanging arms, positive by the right-hand rule about x forward (roll), y lef
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 NUM_SLOTS = 32
 
@@ -37,6 +38,12 @@ MIRROR_PERMUTATION = np.array([SLOT_INDEX[_mirrored(name)] for name in SLOT_NAME
 MIRROR_SIGN = np.array([1.0 if name.endswith("_pitch") else -1.0 for name in SLOT_NAMES])
 """Sign under the mirror: pitch keeps it, roll and yaw lose it, shape (32,)."""
 
+AXES = ("roll", "pitch", "yaw")
+"""Last word of every slot's name: about x forward, y left, z up."""
+
+LEG_AND_WAIST_SLOTS = tuple(range(15))
+HEAD_AND_ARM_SLOTS = tuple(range(15, NUM_SLOTS))
+
 LEG_PITCH_SLOTS = tuple(i for i, n in enumerate(SLOT_NAMES) if n.endswith(("hip_pitch", "knee_pitch", "ankle_pitch")))
 SHOULDER_PITCH_SLOTS = tuple(i for i, n in enumerate(SLOT_NAMES) if n.endswith("shoulder_pitch"))
 HIP_YAW_SLOTS = tuple(i for i, n in enumerate(SLOT_NAMES) if n.endswith("hip_yaw"))
@@ -44,3 +51,12 @@ HIP_DEVIATION_SLOTS = tuple(i for i, n in enumerate(SLOT_NAMES) if n.endswith(("
 WAIST_SLOTS = tuple(i for i, n in enumerate(SLOT_NAMES) if n.startswith("waist"))
 UPPER_SLOTS = tuple(range(12, NUM_SLOTS))
 """Every joint that is not a leg: waist, head and arms (HugWBC 4)."""
+
+
+def slot_frame(name: str) -> NDArray[np.float64]:
+    """Directions of roll, pitch and yaw in the base frame at canonical zero, one a row, shape (3, 3).
+
+    A wrist's are named with the forearm pointing forward, and turn with it when it hangs.
+    """
+    hanging = [[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]
+    return np.array(hanging) if "_wrist_" in name else np.eye(3)

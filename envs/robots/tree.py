@@ -84,6 +84,8 @@ class Link:
     name: str
     inertial: Inertial | None
     shapes: tuple[Shape, ...]
+    collision_mesh: bool
+    """Whether a mesh was to collide; it is not among ``shapes``."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -100,7 +102,13 @@ class Body:
     pose: Pose
     inertial: Inertial
     shapes: tuple[Shape, ...]
+    collision_mesh: bool
     members: dict[str, Pose]
+
+    @property
+    def can_touch(self) -> bool:
+        """Whether it has a collision shape."""
+        return any(not shape.visual for shape in self.shapes)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -194,5 +202,6 @@ def _merged(joint: Joint | None, owner: int, pose: Pose, links: dict[str, Link],
         pose=pose,
         inertial=combine(inertials),
         shapes=tuple(shapes),
+        collision_mesh=any(links[name].collision_mesh for name in members),
         members=members,
     )

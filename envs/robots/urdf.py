@@ -26,6 +26,8 @@ MAX_LENGTH = 10.0
 """Largest distance or size believed [m]."""
 MAX_MASS = 1000.0
 """Largest mass of one link believed [kg]."""
+MIN_BODY_MASS = 0.01
+"""Least mass of a moving body, with all that is fixed to it [kg]; less is a link whose inertia was forgotten."""
 MAX_VALUE = 1e6
 """Largest number believed anywhere else."""
 
@@ -138,7 +140,12 @@ class _Reader:
             for child in element.findall(tag)
             if (shape := self._shape(child, tag == "visual", colours, f"link {name}")) is not None
         ]
-        return Link(name=name, inertial=self._inertial(element, f"link {name}"), shapes=tuple(shapes))
+        return Link(
+            name=name,
+            inertial=self._inertial(element, f"link {name}"),
+            shapes=tuple(shapes),
+            collision_mesh=element.find("collision/geometry/mesh") is not None,
+        )
 
     def _shape(self, element: ET.Element, visual: bool, colours: dict[str, Rgba], where: str) -> Shape | None:
         geometry = element.find("geometry")
@@ -246,8 +253,11 @@ class _Reader:
         if unreached:
             self.faults.append(f"links {sorted(unreached)} form a loop apart from the base")
         for body in tree.bodies:
-            if body.inertial.mass <= 0.0:
-                self.faults.append(f"link {body.name} moves but has no mass")
+            if body.inertial.mass < MIN_BODY_MASS:
+                self.faults.append(
+                    f"link {body.name} moves but weighs {body.inertial.mass:g} kg with all that is fixed to it, "
+                    f"expected at least {MIN_BODY_MASS:g}; give it an <inertial>"
+                )
 
 
 def as_sentence(fault: str) -> str:

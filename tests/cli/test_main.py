@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import importlib
+import subprocess
 import sys
 import types
 import warnings
+from pathlib import Path
 
 import pytest
 
@@ -82,6 +85,42 @@ def test_a_fault_of_ours_is_not_hidden(verb):
     verb.main = fail
     with pytest.raises(ZeroDivisionError):
         cli.main(["stub"])
+
+
+@pytest.mark.parametrize("package", ["eagle_rl.nowhere", "envs.nowhere"])
+def test_a_module_of_ours_that_is_missing_is_not_hidden(verb, package):
+    verb.main = lambda argv: importlib.import_module(package)
+    with pytest.raises(ModuleNotFoundError):
+        cli.main(["stub"])
+
+
+BARE = "import sys\nsys.path.insert(0, {root!r})\nfrom eagle_rl.cli.main import main\nsys.exit(main({words!r}))"
+
+
+def in_a_bare_python(*words):
+    """What ``eagle WORDS`` does in an interpreter without any installed package."""
+    root = str(Path(__file__).resolve().parents[2])
+    command = [sys.executable, "-I", "-S", "-c", BARE.format(root=root, words=list(words))]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize("words", ["train smoke", "play", "evaluate RUN", "status RUN", "robots list"])
+def test_without_the_requirements_a_verb_ends_in_one_line(words):
+    done = in_a_bare_python(*words.split())
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1, done.stderr
+    assert f"is not installed in {sys.executable}. Run make setup" in done.stderr
+
+
+def test_doctor_lists_what_is_missing_without_the_requirements():
+    done = in_a_bare_python("doctor")
+    assert (done.returncode, done.stderr) == (2, "")
+    assert f"FAIL  eagle-rl         not installed in {sys.executable}; run make setup" in done.stdout
+    assert all(
+        f"FAIL  {name:<16} missing, needs >=" in done.stdout for name in ("torch", "mujoco", "rich", "packaging")
+    )
+    assert "FAIL  graphics         cannot be checked without mujoco" in done.stdout
+    assert "ok    folder" in done.stdout
 
 
 def test_a_verb_gets_the_words_after_it(verb):

@@ -25,6 +25,7 @@ LAYOUT = "envs/mdp/layout.py"
 COMMANDS = "envs/mdp/commands.py"
 GEOMETRY = "envs/geometry.py"
 SLOTS = "envs/robots/slots.py"
+CONSISTENCY = "envs/robots/consistency.py"
 EMBODIMENT = "envs/robots/embodiment.py"
 POOLING = "envs/pooling.py"
 STAGING = "envs/sim/staging.py"
@@ -109,6 +110,8 @@ MUTANTS: tuple[Mutant, ...] = (
     ),
     # slots and mirror
     Mutant(SLOTS, '_SIDES = ("right", "left")', '_SIDES = ("left", "right")', "robots/test_slots.py"),
+    Mutant(CONSISTENCY, "turns[index - 1] *= -1.0", "turns[index - 1] *= 1.0", "robots/test_slots.py"),
+    Mutant(CONSISTENCY, "spec.signs[:, None] * ", "", "robots/test_slots.py"),
     Mutant(SLOTS, 'name.endswith("_pitch") else', 'name.endswith("_roll") else', "robots/test_slots.py"),
     Mutant(
         LAYOUT,

@@ -56,12 +56,23 @@ def test_tilted_soles_and_ringing_gains_are_reported(tmp_path: Path) -> None:
     assert sum("it will ring" in finding for finding in findings) == 2
 
 
-def test_a_link_that_cannot_touch_is_reported(tmp_path: Path) -> None:
-    box = "<collision>"
-    head, _, tail = biped_urdf().partition('<link name="torso">')
-    start, end = tail.index(box), tail.index("</collision>") + len("</collision>")
-    findings = check_robot(write_biped(tmp_path, urdf=f'{head}<link name="torso">{tail[:start]}{tail[end:]}'))
-    assert any("torso, the torso, has no collision shape" in finding for finding in findings), findings
+@pytest.mark.parametrize(("instead", "why"), [("", ""), ('<mesh filename="torso.stl"/>', ": its mesh is ignored")])
+def test_a_link_that_cannot_touch_is_reported(tmp_path: Path, instead: str, why: str) -> None:
+    box = '<box size="0.2 0.3 0.4"/>'
+    assert box in biped_urdf()
+    findings = check_robot(write_biped(tmp_path, urdf=biped_urdf().replace(box, instead)))
+    assert any(f"torso, the torso, has no collision shape{why}, so" in finding for finding in findings), findings
+
+
+def test_arms_that_turn_the_other_way_or_do_not_hang_at_zero_are_reported(tmp_path: Path) -> None:
+    data = biped_data()
+    for side in ("left", "right"):
+        data["joints"][f"{side}_elbow_pitch"] |= {"sign": -1, "zero_offset_rad": -1.57}
+    findings = check_robot(write_biped(tmp_path, data=data))
+    assert (
+        sum("elbow_pitch: turns the other way" in finding and "expected sign 1" in finding for finding in findings) == 2
+    )
+    assert sum("the forearm from" in finding and "is 90 degrees off" in finding for finding in findings) == 2
 
 
 @pytest.mark.parametrize("name", ROBOTS)

@@ -60,6 +60,27 @@ def _set(*path: str, to: object) -> Callable[[dict[str, Any]], None]:
     return change
 
 
+def _both(slot: str, key: str, to: object) -> Callable[[dict[str, Any]], None]:
+    def change(data: dict[str, Any]) -> None:
+        for side in ("left", "right"):
+            data["joints"][f"{side}_{slot}"][key] = to
+
+    return change
+
+
+def _exchange(first: str, second: str) -> Callable[[dict[str, Any]], None]:
+    """Give each joint whose slot begins with one word the slot that begins with the other."""
+
+    def change(data: dict[str, Any]) -> None:
+        for entry in data["joints"].values():
+            for old, new in ((first, second), (second, first)):
+                if entry["slot"].startswith(old):
+                    entry["slot"] = entry["slot"].replace(old, new)
+                    break
+
+    return change
+
+
 def _drop(*path: str) -> Callable[[dict[str, Any]], None]:
     def change(data: dict[str, Any]) -> None:
         for key in path[:-1]:
@@ -97,6 +118,22 @@ JOINT = ("joints", "left_knee_pitch")
         (_set("nominal_height_m", to=0.5), "nominal_height_m is 0.5, but in the default pose the base is 0.9100 m"),
         (_set("sole_centre_m", "left", to=[0.0, 0.0]), "sole_centre_m.left is [0.0, 0.0], expected three numbers"),
         (_set("roles", "left_foot", to="right_foot"), "roles: left_foot is at y = -0.100 m"),
+        (
+            _set("joints", "waist_yaw", "sign", to=-1),
+            "waist_yaw: turns the other way than slot waist_yaw, expected sign 1",
+        ),
+        (_both("hip_pitch", "sign", -1), "right_hip_pitch: turns the other way than slot right_hip_pitch"),
+        (
+            _set("joints", "waist_yaw", "slot", to="waist_roll"),
+            "joints.waist_yaw: turns about z (yaw), slot waist_roll is about x; exchange slots",
+        ),
+        (_set("roles", "pelvis", to="torso"), "waist_yaw: turns the other way than slot waist_yaw"),
+        (_exchange("left_", "right_"), "slots: left_shoulder_pitch is at y = -0.200 m in the default pose"),
+        (_exchange("left_hip", "left_knee"), "the thigh from left_hip_pitch to left_knee_pitch is 180 degrees off"),
+        (
+            _both("knee_pitch", "zero_offset_rad", 1.57),
+            "shank from left_knee_pitch to left_ankle_pitch is 90 degrees off",
+        ),
         (_set("name", to=["biped"]), "name is ['biped'], expected letters"),
         (_set("name", to="a/b"), "name is 'a/b', expected letters"),
         (_set(*JOINT, "slot", to={"a": 1}), "unknown slot {'a': 1}"),
@@ -149,6 +186,11 @@ def test_unsound_yaml_is_refused(tmp_path: Path, text: str, expected: str) -> No
         ('<mass value="2.0"/>', '<mass value="-1"/>', "mass is -1 kg"),
         ('<mass value="2.0"/>', '<mass value="nan"/>', "value='nan', expected 1 finite number(s)"),
         ('<mass value="2.0"/>', '<mass value="1e9"/>', "of at most 1000"),
+        (
+            '<mass value="4.0"/>',
+            '<mass value="0.001"/>',
+            "pelvis moves but weighs 0.001 kg with all that is fixed to it",
+        ),
         ('ixy="0"', 'ixy="5"', "is not that of a body"),
         ('lower="-0.1" upper="2.0"', 'lower="2.0" upper="-0.1"', "limits [2, -0.1] rad, expected lower < upper"),
         ('effort="100.0"', 'effort="0"', "must be positive"),
@@ -194,6 +236,21 @@ def test_a_loop_beside_the_base_is_refused(tmp_path: Path) -> None:
         for a, b in (("p", "q"), ("q", "p"))
     )
     assert "['p', 'q'] form a loop" in _refusal(tmp_path, urdf=biped_urdf().replace("</robot>", loop + "</robot>"))
+
+
+def test_legs_that_cannot_bend_at_the_ankle_are_refused(tmp_path: Path) -> None:
+    urdf, data = biped_urdf(), biped_data()
+    for side in ("left", "right"):
+        del data["joints"][f"{side}_ankle_pitch"]
+        urdf = urdf.replace(f'"{side}_ankle_pitch" type="revolute"', f'"{side}_ankle_pitch" type="fixed"')
+    assert "no joint in slots right_ankle_pitch, left_ankle_pitch; legs" in _refusal(tmp_path, urdf, data)
+
+
+def test_a_foot_that_can_touch_nothing_is_refused(tmp_path: Path) -> None:
+    box = '<box size="0.2 0.08 0.04"/>'
+    message = _refusal(tmp_path, urdf=biped_urdf().replace(box, '<mesh filename="foot.stl"/>'))
+    assert message.count("_foot, has no collision shape: its mesh is ignored, so it would sink into the ground") == 2
+    assert "give it a <collision> with a box" in message
 
 
 def test_sizes_are_capped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
