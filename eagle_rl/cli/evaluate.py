@@ -195,7 +195,7 @@ def _is_result(path: Path) -> bool:
     """Whether a path is a stored result, not the manifest of a policy."""
     from eagle_rl.runners.published import SUFFIX
 
-    if path.suffix != ".json":
+    if path.suffix != ".json" or not path.exists():
         return False
     return not (path.name.startswith("model_") or path.with_suffix(SUFFIX).exists())
 
