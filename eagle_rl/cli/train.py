@@ -98,9 +98,26 @@ def main(argv: Sequence[str]) -> int:
     from eagle_rl.runners.team import Team
 
     with Team(cfg.run.device) as team:
-        run_dir = args.resume or team.agree(lambda: create_run(cfg, args.out, provenance))
+        run_dir = team.agree(lambda: _begin(cfg, args, provenance, team.size))
         _train(cfg, run_dir, args, provenance, team)
     return 0
+
+
+def _begin(cfg: ExperimentCfg, args: argparse.Namespace, provenance: Provenance, processes: int) -> Path:
+    """The run's directory, once nothing speaks against going on in it, or against making it."""
+    from eagle_rl.runners.records import open_plan
+    from eagle_rl.runners.sources import check_sources
+    from envs.mdp.layout import ObservationLayout
+
+    stages = plan_stages(cfg, processes)
+    if args.resume is not None:
+        run_dir: Path = args.resume
+        open_plan(run_dir, provenance, stages, resume=True, allow_drift=args.allow_drift)
+        return run_dir
+    layout = ObservationLayout(cfg.task.observations)
+    columns = {group: layout.size(group) for group in ("history", "command", "clock", "estimate")}
+    check_sources(cfg, stages, provenance.slot_table_hash, columns)
+    return create_run(cfg, args.out, provenance)
 
 
 def _train(cfg: ExperimentCfg, run_dir: Path, args: argparse.Namespace, provenance: Provenance, team: Team) -> None:
