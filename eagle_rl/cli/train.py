@@ -8,7 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from eagle_rl.config.compose import known_names
+from eagle_rl.config.compose import descriptions, known_names
 from eagle_rl.config.load import load_experiment, to_yaml
 from eagle_rl.config.schema import ExperimentCfg
 from eagle_rl.errors import ConfigError
@@ -37,7 +37,9 @@ def _parser() -> argparse.ArgumentParser:
         usage="eagle train EXPERIMENT [key=value ...] [options]\n"
         "       eagle train --resume RUN [key=value ...] [options]",
         description="Train an experiment into a new run directory, or continue one.",
-        epilog=f"Experiments: {', '.join(known_names('experiment'))}, or the path of a YAML file.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog="experiments, or the path of a YAML file:\n"
+        + "\n".join(f"  {name:<18} {what}" for name, what in descriptions("experiment").items()),
     )
     parser.add_argument(
         "words", nargs="*", metavar="EXPERIMENT key=value", help="e.g. ppo algo.gamma=0.98 robots=[h1,g1]"
