@@ -41,8 +41,9 @@ def misplaced(path: Path, wrong: str, *patterns: str) -> str:
             its folder.
     """
     if not path.exists():
-        beside = [entry.name for entry in path.parent.glob(f"*{path.suffix}")]
-        return f"{path}: no such {'file' if path.suffix else 'folder'}.{did_you_mean(path.name, beside)}"
+        beside = path.parent.iterdir() if path.parent.is_dir() else ()
+        nearest = did_you_mean(path.name, [entry.name for entry in beside if entry.suffix == path.suffix])
+        return f"{path}: no such {'file' if path.suffix else 'folder'}.{nearest}"
     found = sorted((x for pattern in patterns for x in path.glob(pattern)), key=lambda x: x.stat().st_mtime)[::-1]
     names = [str(x.parent if x.name == "plan.json" else x) for x in found[:_FEW]]
     more = f" and {len(found) - _FEW} more" if len(found) > _FEW else ""

@@ -121,7 +121,7 @@ def test_only_notes_that_apply_stand_under_a_table():
     for note in ("Bold", "In brackets", "±", "Unseen"):
         assert note not in to_markdown(plain), note
         assert note in to_markdown(full), note
-    assert "M steps: millions" in to_markdown(plain)
+    assert "millions of environment steps" in to_markdown(plain)
     assert "In brackets" not in to_latex(plain)
     assert "In brackets" in to_latex(full)
 
