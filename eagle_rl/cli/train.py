@@ -118,7 +118,7 @@ def _begin(cfg: ExperimentCfg, args: argparse.Namespace, provenance: Provenance,
         return run_dir
     layout = ObservationLayout(cfg.task.observations)
     columns = {group: layout.size(group) for group in ("history", "command", "clock", "estimate")}
-    check_sources(cfg, stages, provenance.slot_table_hash, columns)
+    check_sources(cfg, stages, provenance, columns)
     return create_run(cfg, args.out, provenance)
 
 

@@ -72,7 +72,7 @@ def run_experiment(
     now = dataclasses.replace(provenance or Provenance(), config=dataclasses.asdict(cfg))
     stages = plan_stages(cfg, team.size)
     if not resume:
-        check_sources(cfg, stages, now.slot_table_hash)
+        check_sources(cfg, stages, now)
     provenance = team.agree(lambda: open_plan(run_dir, now, stages, resume=resume, allow_drift=allow_drift))
     allow_drift |= provenance.drifted  # its checkpoints may be from before
     worker = Worker(cfg, stages, run_dir, make_env, provenance, team, allow_drift, jobs)
