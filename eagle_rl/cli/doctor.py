@@ -166,7 +166,8 @@ def _findings(check: Callable[[], list[Finding]]) -> list[Finding]:
 
 def main(argv: Sequence[str]) -> int:
     """Run ``eagle doctor``; 2 if something is missing without which nothing works."""
-    argparse.ArgumentParser(prog="eagle doctor", description=__doc__).parse_args(argv)
+    description = "Check that this installation is complete and what this machine can do."
+    argparse.ArgumentParser(prog="eagle doctor", description=description).parse_args(argv)
     findings: list[Finding] = []
     for check in (check_machine, check_packages, check_data, check_compiler, check_graphics, check_folder):
         findings += _findings(check)

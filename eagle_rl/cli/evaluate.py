@@ -40,6 +40,9 @@ METHODS = {
 }
 """The paper's name for each of its experiments."""
 
+QUICK_ENVS = 32
+"""Environments a robot for a first look."""
+
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
@@ -49,7 +52,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("checkpoints", nargs="+", metavar="[NAME=]CKPT", help="checkpoint, stage, run, or result .json")
     parser.add_argument("--robots", metavar="A,B", help="robots to judge on, or all [those it was trained on]")
-    parser.add_argument("--envs", type=count, metavar="N", help="environments per robot [the experiment's]")
+    parser.add_argument("--envs", type=count, metavar="N", help="environments per robot [the experiment's, mostly 256]")
     parser.add_argument("--steps", type=count, metavar="N", help="control steps [the experiment's, 1000 in the paper]")
     parser.add_argument(
         "--protocol",
@@ -129,6 +132,13 @@ def _find(word: str, args: argparse.Namespace) -> tuple[str, EvaluationResult | 
     return name or _method(policy.cfg), _Trial(policy, ev, robots, finishing_ranges(policy.cfg.task.commands))
 
 
+def announcement(name: str, ev: EvaluationCfg, robots: Sequence[str]) -> str:
+    """What is going to be simulated, and how to have it sooner."""
+    size = f"{len(robots)} robot{'s' * (len(robots) > 1)} x {ev.num_envs_per_robot} environments x {ev.num_steps} steps"
+    hint = f" (--envs {QUICK_ENVS} is quicker)" if ev.num_envs_per_robot > QUICK_ENVS else ""
+    return f"{name}: judging {size}{hint}"
+
+
 def _judge(name: str, trial: _Trial, console: Console) -> EvaluationResult:
     """Evaluate one policy, with progress."""
     from rich.progress import Progress
@@ -140,6 +150,7 @@ def _judge(name: str, trial: _Trial, console: Console) -> EvaluationResult:
     policy, ev, robots = trial.policy, trial.protocol, trial.robots
     cfg = policy.cfg
     make_env = make_env_factory(cfg.run)
+    console.print(announcement(name, ev, robots), highlight=False, markup=False, soft_wrap=True)
     with Progress(console=console, transient=True) as progress:
         bar = progress.add_task(name, total=len(robots) * ev.num_envs_per_robot * ev.num_steps)
         scores = evaluate(policy.act, make_env, robots, cfg.task, ev, on_step=lambda n: progress.advance(bar, n))
@@ -189,7 +200,7 @@ def _is_result(path: Path) -> bool:
     """Whether a path is a stored result, not the manifest of a policy."""
     from eagle_rl.runners.published import SUFFIX
 
-    if path.suffix != ".json":
+    if path.suffix != ".json" or not path.exists():
         return False
     return not (path.name.startswith("model_") or path.with_suffix(SUFFIX).exists())
 

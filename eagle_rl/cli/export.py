@@ -27,7 +27,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("checkpoint", type=Path, metavar="CKPT", help="checkpoint, stage or run")
     parser.add_argument(
-        "--out", type=Path, metavar="FILE.onnx", help="[next to the checkpoint, with the contract's hash in its name]"
+        "--out", type=Path, metavar="FILE.onnx", help="[in the folder you are in, named after checkpoint and contract]"
     )
     parser.add_argument(
         "--publish", type=Path, metavar="NAME", help="write NAME.safetensors, NAME.json and NAME.onnx instead"
@@ -143,9 +143,8 @@ def main(argv: Sequence[str]) -> int:
             print("no ONNX: its correction reads the gait's phase, which no ONNX policy gets")
             return 0
     contract = build_contract(policy.cfg, policy.sha256, policy.cfg.robots)
-    stem = policy.checkpoint.stem
-    name = stem if args.publish else f"{stem}_{contract.digest[:8]}"
-    out = args.out or policy.checkpoint.with_name(f"{name}.onnx")
+    own = Path(f"{policy.checkpoint.stem}_{contract.digest[:8]}.onnx")
+    out = policy.checkpoint.with_suffix(".onnx") if args.publish else args.out or own
     difference = export_onnx(policy.actor, contract, out)
     print(f"{out}: {', '.join(contract.robots)}; differs from torch by at most {difference:.1g}")
     return 0

@@ -34,7 +34,7 @@ INTERRUPTED = 130
 
 _FIRST = """first steps:
   eagle doctor               is everything here?
-  eagle play                 watch the published policy, or your newest run
+  eagle play                 watch the published policy; eagle play --last your newest run
   eagle train quickstart     train your own in minutes; eagle status RUN tells how far it is
 
 eagle VERB --help tells more."""
@@ -51,7 +51,10 @@ def guarded(action: Callable[[], int]) -> int:
     """Run ``action``; report a user's error in words, and return the exit code."""
     try:
         with _warnings_in_words():
-            return action()
+            try:
+                return action()
+            finally:
+                sys.stdout.flush()  # here, where a reader who has left is no fault
     except EagleError as error:
         print(f"error: {error}", file=sys.stderr)
         return error.exit_code
@@ -105,16 +108,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Entry point of the ``eagle`` command."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     verb = arguments[0] if arguments else "--help"
-    if verb in VERBS:
-        return run_verb(verb, arguments[1:])
-    if verb in ("-h", "--help", "help"):
-        print(usage())
-        return 0
-    if verb in ("-V", "--version"):
-        print(__version__)
-        return 0
-    print(f"error: no verb {verb!r}.{did_you_mean(verb, VERBS)} Known: {', '.join(VERBS)}.", file=sys.stderr)
-    return 2
+    return run_verb(verb, arguments[1:]) if verb in VERBS else guarded(lambda: _answer(verb))
+
+
+def _answer(word: str) -> int:
+    """Help or the version, asked for instead of a verb."""
+    if word not in ("-h", "--help", "help", "-V", "--version"):
+        raise EagleError(f"no verb {word!r}.{did_you_mean(word, VERBS)} Known: {', '.join(VERBS)}.")
+    print(__version__ if word in ("-V", "--version") else usage())
+    return 0
 
 
 if __name__ == "__main__":

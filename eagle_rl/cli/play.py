@@ -14,7 +14,7 @@ from eagle_rl.config.commands import CommandScript, load_commands
 from eagle_rl.config.compose import known_names
 from eagle_rl.config.validate import CONTROL_STEP
 from eagle_rl.errors import CheckpointError, ConfigError
-from eagle_rl.paths import data_root
+from eagle_rl.paths import data_root, shown
 
 from .arguments import duration
 from .policy import chosen_robots, load_policy
@@ -31,7 +31,8 @@ FRAME_STEPS = 2
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="eagle play",
-        description="Show a checkpoint on several robots side by side. Without a display a video is made.",
+        description="Show a checkpoint on several robots side by side. Without a display a video is made in the "
+        "folder you are in.",
         epilog="Example: python play.py logs/quickstart/RUN --robots h1,g1 --video two.mp4",
     )
     parser.add_argument(
@@ -39,8 +40,9 @@ def _parser() -> argparse.ArgumentParser:
         nargs="?",
         type=Path,
         metavar="CKPT",
-        help="checkpoint, stage or run [the published policy, or the newest run in logs/]",
+        help="checkpoint, stage or run [the published policy]",
     )
+    parser.add_argument("--last", action="store_true", help="show the newest run in logs/")
     parser.add_argument("--robots", metavar="A,B|all", help="robots to show [those it was trained on]")
     parser.add_argument(
         "--viewer",
@@ -85,6 +87,13 @@ def newest_run(logs: Path = Path("logs")) -> Path:
     return logs.joinpath(*newest.relative_to(logs).parts[:2])
 
 
+def _chosen(args: argparse.Namespace) -> Path:
+    """What is to be shown; without a word of it the published policy, where it was not left out of the installation."""
+    if args.last or not (args.checkpoint or PUBLISHED.is_file()):
+        return newest_run()
+    return args.checkpoint or PUBLISHED
+
+
 def _load(args: argparse.Namespace, checkpoint: Path, seconds: float) -> Session:
     """The policy and its robots, ready to move."""
     from .session import Session
@@ -97,6 +106,8 @@ def _load(args: argparse.Namespace, checkpoint: Path, seconds: float) -> Session
 def main(argv: Sequence[str]) -> int:
     """Run ``eagle play``."""
     args = _parser().parse_args(argv)
+    if args.last and args.checkpoint is not None:
+        raise ConfigError(f"--last and {args.checkpoint}: --last is the newest run in logs/. Give one of them.")
     files = args.video or args.contact_sheet
     viewer = args.viewer or ("native" if has_display() and not files else "none")
     if viewer == "native" and not has_display():
@@ -116,11 +127,11 @@ def main(argv: Sequence[str]) -> int:
 
     from eagle_rl.runners.locate import find_checkpoint
 
-    checkpoint = find_checkpoint(args.checkpoint or (PUBLISHED if PUBLISHED.is_file() else newest_run()))
+    checkpoint = find_checkpoint(_chosen(args))
+    print(f"playing {shown(checkpoint)}", file=sys.stderr)
     if viewer == "none":
         seconds = args.seconds or script.duration
-        beside = Path(checkpoint.name) if checkpoint == PUBLISHED else checkpoint
-        video = args.video if files else beside.with_suffix(".mp4")
+        video = args.video if files else Path(checkpoint.name).with_suffix(".mp4")
         film(_load(args, checkpoint, seconds), script, seconds, video, args.contact_sheet)
     else:
         watch = _viewer(viewer)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from eagle_rl.config.schema import EvaluationCfg, ExperimentCfg, ObservationsCfg
 from eagle_rl.errors import ConfigError
+from eagle_rl.paths import RUNS, misplaced
 
 from .arguments import count, device, require_folder
 from .environment import make_env_factory
@@ -88,14 +89,17 @@ def _curves(args: argparse.Namespace) -> dict[str, Figure]:
         stages = (
             {s.name: stage_dir(path, s.name) for s in read_plan(path)} if (path / "plan.json").exists() else {"": path}
         )
-        for stage, folder in stages.items():
-            file = folder if folder.is_file() else folder / "metrics.jsonl"
-            if file.exists() or len(stages) == 1:
-                title = f"{name}_{stage}".strip("_").replace("/", "_")
-                panels = read_curves(file, args.smooth)
-                if panels:
-                    figures[title] = plots.learning_curves(panels)
-                    _write(args.out / f"curves_{title}.csv", curves_to_csv(panels))
+        files = {stage: folder if folder.is_file() else folder / "metrics.jsonl" for stage, folder in stages.items()}
+        begun = {stage: file for stage, file in files.items() if file.exists()}
+        if not begun:
+            wrong = "no numbers of training there. Name a run, or the folder of a stage, that has begun."
+            raise ConfigError(misplaced(path, wrong, *RUNS))
+        for stage, file in begun.items():
+            title = f"{name}_{stage}".strip("_").replace("/", "_")
+            panels = read_curves(file, args.smooth)
+            if panels:
+                figures[title] = plots.learning_curves(panels)
+                _write(args.out / f"curves_{title}.csv", curves_to_csv(panels))
     return figures
 
 

@@ -20,7 +20,9 @@ TABLE_WIDTH = 160
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="eagle robots", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="eagle robots", description="Show the shipped robots, slot by slot, or check a new one."
+    )
     actions = parser.add_subparsers(dest="action", required=True, metavar="list|show|check|slots")
     actions.add_parser("list", help="one line a robot")
     actions.add_parser("slots", help="the 32 slots and the joint each robot has in them")

@@ -14,7 +14,7 @@ from typing import Any
 from eagle_rl.config.load import load_experiment, to_yaml
 from eagle_rl.config.schema import ExperimentCfg
 from eagle_rl.errors import CheckpointError, ConfigError
-from eagle_rl.paths import data_root
+from eagle_rl.paths import RUNS, data_root, misplaced
 from eagle_rl.runners.provenance import CONFIG, Provenance
 
 _README = """\
@@ -107,5 +107,5 @@ def open_run(run_dir: Path, overrides: list[str]) -> ExperimentCfg:
     """
     path = run_dir / CONFIG
     if not path.is_file():
-        raise CheckpointError(f"{run_dir}: not a run directory: it has no {CONFIG}.")
+        raise CheckpointError(misplaced(run_dir, f"not a run directory: it has no {CONFIG}.", *RUNS))
     return load_experiment(str(path), overrides)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from eagle_rl.config.commands import load_commands
 from eagle_rl.config.compose import known_names
-from eagle_rl.errors import ConfigError
+from eagle_rl.errors import ConfigError, RobotError
 
 if TYPE_CHECKING:
     import mujoco
@@ -39,9 +39,17 @@ class Outcome:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="eagle sim2sim", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="eagle sim2sim",
+        description="An exported policy in plain MuJoCo, with another step and solver than in training, without torch.",
+    )
     parser.add_argument("policy", type=Path, metavar="FILE.onnx", help="what eagle export wrote")
-    parser.add_argument("--robot", required=True, metavar="NAME|FILE", help="one of the robots in the file")
+    parser.add_argument(
+        "--robot",
+        required=True,
+        metavar="NAME|FILE",
+        help="one of the robots in the file: a shipped one by name, another by its YAML",
+    )
     parser.add_argument(
         "--commands",
         default="demo",
@@ -58,9 +66,8 @@ def main(argv: Sequence[str]) -> int:
     script = load_commands(args.commands)
 
     from eagle_rl.export.runtime import OnnxPolicy
-    from envs.robots.load import load_robot
 
-    spec = load_robot(args.robot)
+    spec = _load_robot(args.robot, args.policy)
     policy = OnnxPolicy(args.policy, spec.name)
     substeps = round(policy.contract.step_dt / args.physics_dt) if args.physics_dt > 0 else 0
     if not 1 <= substeps <= MAX_SUBSTEPS or abs(substeps * args.physics_dt - policy.contract.step_dt) > 1e-9:
@@ -72,6 +79,19 @@ def main(argv: Sequence[str]) -> int:
     for (name, unit), error in zip(ERRORS, outcome.errors, strict=True):
         print(f"  {name:<8}{error:7.3f} {unit}")
     return 0
+
+
+def _load_robot(robot: str, policy: Path) -> RobotSpec:
+    """The body of a robot, which a policy's file does not hold."""
+    from eagle_rl.export.runtime import load_session
+    from envs.robots.load import load_robot
+
+    known = load_session(policy)[1].robots
+    if robot in known and robot not in known_names("robots"):
+        raise RobotError(
+            f"{robot} is in {policy}; plain MuJoCo needs its YAML too: --robot PATH, with `name: {robot}` in that file."
+        )
+    return load_robot(robot)
 
 
 def simulate(policy: OnnxPolicy, spec: RobotSpec, script: CommandScript, substeps: int) -> Outcome:

@@ -9,7 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from eagle_rl.config.compose import known_names
+from eagle_rl.config.compose import descriptions, known_names
 from eagle_rl.config.load import load_experiment, to_yaml
 from eagle_rl.config.schema import ExperimentCfg
 from eagle_rl.errors import ConfigError, RobotError
@@ -38,7 +38,9 @@ def _parser() -> argparse.ArgumentParser:
         usage="eagle train EXPERIMENT [key=value ...] [options]\n"
         "       eagle train --resume RUN [key=value ...] [options]",
         description="Train an experiment into a new run directory, or continue one.",
-        epilog=f"Experiments: {', '.join(known_names('experiment'))}, or the path of a YAML file.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog="experiments, or the path of a YAML file:\n"
+        + "\n".join(f"  {name:<18} {what}" for name, what in descriptions("experiment").items()),
     )
     parser.add_argument(
         "words", nargs="*", metavar="EXPERIMENT key=value", help="e.g. ppo algo.gamma=0.98 robots=[h1,g1]"
@@ -105,9 +107,26 @@ def main(argv: Sequence[str]) -> int:
     from eagle_rl.runners.team import Team
 
     with Team(cfg.run.device) as team:
-        run_dir = args.resume or team.agree(lambda: create_run(cfg, args.out, provenance))
+        run_dir = team.agree(lambda: _begin(cfg, args, provenance, team.size))
         _train(cfg, run_dir, args, provenance, team)
     return 0
+
+
+def _begin(cfg: ExperimentCfg, args: argparse.Namespace, provenance: Provenance, processes: int) -> Path:
+    """The run's directory, once nothing speaks against going on in it, or against making it."""
+    from eagle_rl.runners.records import open_plan
+    from eagle_rl.runners.sources import check_sources
+    from envs.mdp.layout import ObservationLayout
+
+    stages = plan_stages(cfg, processes)
+    if args.resume is not None:
+        run_dir: Path = args.resume
+        open_plan(run_dir, provenance, stages, resume=True, allow_drift=args.allow_drift)
+        return run_dir
+    layout = ObservationLayout(cfg.task.observations)
+    columns = {group: layout.size(group) for group in ("history", "command", "clock", "estimate")}
+    check_sources(cfg, stages, provenance, columns)
+    return create_run(cfg, args.out, provenance)
 
 
 def _train(cfg: ExperimentCfg, run_dir: Path, args: argparse.Namespace, provenance: Provenance, team: Team) -> None:

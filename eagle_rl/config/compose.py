@@ -7,6 +7,7 @@ is the path of a YAML file, it starts from the folder of the file it is written 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -22,6 +23,16 @@ _NOT_INHERITED = ("name", "description")
 def known_names(kind: str) -> list[str]:
     """Names of the files in ``cfg/<kind>``."""
     return sorted(path.stem for path in (data_root() / "cfg" / kind).glob("*.yaml"))
+
+
+def descriptions(kind: str) -> dict[str, str]:
+    """The ``description`` of each file in ``cfg/<kind>``, by name; for ``--help``, which cannot wait for YAML."""
+    found = {}
+    for name in known_names(kind):
+        text = (data_root() / "cfg" / kind / f"{name}.yaml").read_text(encoding="utf-8")
+        match = re.search(r"^description:\s*(.*)$", text, flags=re.MULTILINE)
+        found[name] = match[1] if match else ""
+    return found
 
 
 def find_file(kind: str, name: str, where: str = "command line", folder: Path = Path()) -> Path:

@@ -63,8 +63,10 @@ def read_curves(metrics: Path, smoothing: int = 1) -> dict[str, list[Curve]]:
         metrics: file with one JSON object per iteration, or what :func:`curves_to_csv` wrote.
         smoothing: iterations averaged into one point.
     """
-    if not metrics.exists():
-        raise ConfigError(f"{metrics}: no such file. Name a run or the folder of a stage that has begun to train.")
+    if metrics.suffix not in (".jsonl", ".csv"):
+        raise ConfigError(
+            f"{metrics}: holds no curves. Name a run, the folder of a stage, its metrics.jsonl, or a .csv of curves."
+        )
     try:
         lines = metrics.read_text(encoding="utf-8").splitlines()
         if metrics.suffix == ".csv":

@@ -21,8 +21,12 @@ STRIDE_S = 0.2
 """Time between samples [s]."""
 REDRAW_S = 4.0
 """Time between commands [s]."""
-_CONSTANT = 1e-9
-"""Variance of a target, in units of the estimate, under which it counts as constant."""
+MIN_SPREAD = 0.1
+"""Standard deviation of a target, in units of the estimate, under which there is nothing to explain [-].
+
+A unit is what a channel varies by over the robots that o_ea is standardised with, and what the estimator's loss counts
+in. A smaller spread costs who ignores it less than a hundredth of a channel's loss, and an error small in units is a
+multiple of it, so that the ratio of the two tells nothing."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,7 +79,7 @@ class ChannelScore:
     """How well one channel is recovered."""
 
     explained: float | None
-    """Explained variance, 1 - Var(error) / Var(target); None where the target does not vary."""
+    """Explained variance, 1 - Var(error) / Var(target); None where the target varies less than ``MIN_SPREAD``."""
     rmse: float
     """Root of the mean squared error, bias included [unit of the channel]."""
     prior: float
@@ -131,18 +135,31 @@ def judge_estimator(
         task: the task the policy was trained in; randomization is the full table, however narrow it was in training.
         ev: environments per robot, steps, seed and physics.
         channels: what the first columns of the observation group "estimate" hold; others are left out.
+
+    Raises:
+        ConfigError: there are no samples: too few steps, or everybody fell.
     """
     ev = replace(ev, protocol="joint", resampling_time_s=REDRAW_S, randomization=True, noise=True)
     task = evaluation_task(replace(task, randomization=RandomizationCfg()), ev)
+    if ev.num_steps <= _warm_up(task):
+        raise ConfigError(
+            f"--steps {ev.num_steps} is {ev.num_steps * step_dt(task):g} s; sampling begins after {WARM_UP_S:g} s, "
+            f"give at least {_warm_up(task) + 1}."
+        )
     sampled = {robot: _sample(actor, make_env, robot, task, ev, len(channels)) for robot in robots}
     return report(sampled, channels)
+
+
+def _warm_up(task: TaskCfg) -> int:
+    """Control steps before the first sample."""
+    return round(WARM_UP_S / step_dt(task))
 
 
 def _sample(actor: EagleActor, make_env: MakeEnv, robot: str, task: TaskCfg, ev: EvaluationCfg, width: int) -> Sampled:
     """Roll out one robot."""
     env = make_env([robot], ev.num_envs_per_robot, task, ev.seed)
     commands = draw_commands(task.commands, ev, robot, ev.num_envs_per_robot)
-    warm_up, stride = round(WARM_UP_S / step_dt(task)), round(STRIDE_S / step_dt(task))
+    warm_up, stride = _warm_up(task), round(STRIDE_S / step_dt(task))
     alive = torch.ones(ev.num_envs_per_robot, dtype=torch.bool)
     sampled = Sampled(width)
     for t in range(ev.num_steps):
@@ -183,7 +200,7 @@ def _scores(channels: Sequence[Channel], sampled: Sampled, target: Tensor, error
     columns = zip(channels, target.tolist(), error.tolist(), sampled.error.mean_square.tolist(), strict=True)
     return tuple(
         ChannelScore(
-            explained=1.0 - of_error / of_target if of_target > _CONSTANT * count else None,
+            explained=1.0 - of_error / of_target if of_target >= MIN_SPREAD**2 * count else None,
             rmse=channel.scale * math.sqrt(mean_square),
             prior=channel.scale * math.sqrt(of_target / count),
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 
-from eagle_rl.evaluation.estimator import ChannelScore, EstimatorReport
+from eagle_rl.evaluation.estimator import MIN_SPREAD, ChannelScore, EstimatorReport
 
 
 def _share(value: float | None) -> str:
@@ -28,7 +28,8 @@ def describe(envs: int, steps: int, seed: int, checkpoint: str) -> str:
     """What the numbers mean, and what has to be known to repeat them."""
     return (
         "Explained variance, 1 - Var(error) / Var(target): over the whole fleet, where telling the robots apart "
-        "explains most; within robots, variances about each robot's own mean; and of each robot. RMSE is over the "
+        "explains most; within robots, variances about each robot's own mean; and of each robot; "
+        f"- where a target varies by less than {MIN_SPREAD:g} of the channel's unit in the loss. RMSE is over the "
         "fleet, bias included. Priors are standard deviations: the fleet's is the error of somebody who knows nothing, "
         "a robot's that of somebody who knows which robot it is and nothing more. "
         f"{envs} environments a robot, {steps} steps, five samples a second from 1 s on until the first fall; full "

@@ -11,6 +11,7 @@ from eagle_rl.evaluation.report import Cell, Row, Table
 
 SYMBOLS = ("E_vx", "E_vy", "E_w", "E_h", "E_p")
 UNITS = ("m/s", "m/s", "rad/s", "m", "rad")
+_BRACKETS = "In brackets: the paper's number."
 
 
 def _number(value: float | None, digits: int = 3) -> str:
@@ -52,6 +53,24 @@ def _millions(row: Row) -> str:
     return "-" if row.env_steps is None else f"{row.env_steps / 1e6:.1f}"
 
 
+def _notes(table: Table, bold: bool) -> str:
+    """What stands in the table and does not explain itself."""
+    cells = [cell for row in table.rows for cell in row.cells]
+    notes = {
+        "Bold: the lowest of a robot's judged methods.": bold,
+        _BRACKETS: _has_paper(table),
+        "± is the standard deviation over training seeds.": any(cell.std is not None for cell in cells),
+        "M steps of the run: millions of environment steps of the run that made a seed's policy; what a root from "
+        "elsewhere had cost before is not counted.": any(row.env_steps is not None for row in table.rows),
+        "Unseen: the method was not trained on this robot.": any(row.unseen for row in table.rows),
+    }
+    return " ".join(note for note, applies in notes.items() if applies)
+
+
+def _has_paper(table: Table) -> bool:
+    return any(cell.paper is not None for row in table.rows for cell in row.cells)
+
+
 def to_markdown(table: Table) -> str:
     """GitHub Markdown, one table for all robots; the paper's numbers in brackets."""
     head = [
@@ -79,13 +98,9 @@ def to_markdown(table: Table) -> str:
         ]
         lines.append("| " + " | ".join(cells) + " |")
     hashes = [f"- {method}: {', '.join(h[:12] for h in hashes)}" for method, hashes in table.checkpoints.items()]
-    note = (
-        "Bold: the lowest of a robot's judged methods. In brackets: the paper's number. "
-        "± is the standard deviation over training seeds. M steps of the run: millions of environment steps of the run "
-        "that made a seed's policy; what a root from elsewhere had cost before is not counted. "
-        "Unseen: the method was not trained on this robot."
+    return "\n".join(
+        [*lines, "", table.caption, _notes(table, bool(best)), "", "Checkpoints (sha256):", "", *hashes, ""]
     )
-    return "\n".join([*lines, "", table.caption, note, "", "Checkpoints (sha256):", "", *hashes, ""])
 
 
 def to_csv(table: Table) -> str:
@@ -121,7 +136,7 @@ def to_latex(table: Table) -> str:
     symbols = ("$E_{v_x}$", "$E_{v_y}$", r"$E_{\omega}$", "$E_h$", "$E_p$")
     lines = [
         r"\begin{table}",
-        rf"\caption{{{_latex(table.caption)} In brackets: the paper's number.}}",
+        rf"\caption{{{_latex(table.caption)}{f' {_BRACKETS}' * _has_paper(table)}}}",
         r"\begin{tabular}{ll" + "r" * (len(symbols) + 1) + "}",
         r"\toprule",
         " & ".join(["robot", "method", *symbols, "survival"]) + r" \\",

@@ -76,7 +76,7 @@ def _over_seeds(values: Sequence[float | None], paper: float | None = None) -> C
 
 
 _DRAWN = {
-    "single": "one command drawn, the others zero",
+    "single": "four commands zero, the other drawn",
     "joint": "all five commands drawn",
     "upright": "height and pitch zero, velocities drawn",
     "standing": "velocities exactly zero, height and pitch drawn",

@@ -13,6 +13,7 @@ import onnxruntime
 from numpy.typing import ArrayLike, NDArray
 
 from eagle_rl.errors import CheckpointError, RobotError, did_you_mean
+from eagle_rl.paths import misplaced
 
 from .contract import DIGEST_KEY, METADATA_KEY, Contract
 
@@ -39,13 +40,16 @@ def load_session(path: Path) -> tuple[onnxruntime.InferenceSession, Contract]:
     Raises:
         CheckpointError: the file is missing, damaged, or was not exported by us.
     """
+    if not path.is_file():
+        raise CheckpointError(misplaced(path, "a folder, expected a file that `eagle export` wrote.", "*.onnx"))
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     options.log_severity_level = 3
     try:
         session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
     except Exception as error:
-        raise CheckpointError(f"{path}: cannot be opened as ONNX: {str(error).splitlines()[0]}") from error
+        reason = str(error).splitlines()[0].split(" : ")[-1]  # after onnxruntime's own codes
+        raise CheckpointError(f"{path}: cannot be opened as ONNX: {reason} Make one: eagle export CKPT.") from error
     metadata = session.get_modelmeta().custom_metadata_map
     if METADATA_KEY not in metadata:
         raise CheckpointError(f"{path}: holds no contract, so it does not come from `eagle export`.")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from eagle_rl.errors import CheckpointError
+from eagle_rl.paths import RUNS, misplaced
 from eagle_rl.runners.checkpoint import latest_checkpoint
 from eagle_rl.runners.published import SUFFIX
 from eagle_rl.runners.records import read_plan, stage_dir
@@ -22,7 +23,10 @@ def find_checkpoint(path: Path) -> Path:
     """
     if path.suffix in (".pt", ".json", SUFFIX):
         published = path.with_suffix(SUFFIX)
-        return published if path.suffix == SUFFIX or published.exists() else path.with_suffix(".pt")
+        file = published if path.suffix == SUFFIX or published.exists() else path.with_suffix(".pt")
+        if not (path.exists() or file.exists()):
+            raise CheckpointError(misplaced(path, ""))
+        return file
     folders = [path, path / "checkpoints"]
     if (path / "plan.json").exists():
         generalists = [stage.name for stage in read_plan(path) if not stage.specialised]
@@ -31,4 +35,5 @@ def find_checkpoint(path: Path) -> Path:
         found = latest_checkpoint(folder)
         if found is not None:
             return found
-    raise CheckpointError(f"{path}: no checkpoint there. Name a model_<iteration>.pt, a stage's folder, or a run.")
+    wrong = f"no checkpoint there. Name a model_<iteration>.pt, a NAME{SUFFIX}, a stage's folder, or a run."
+    raise CheckpointError(misplaced(path, wrong, f"*{SUFFIX}", "*.pt", *RUNS))

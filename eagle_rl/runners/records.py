@@ -15,6 +15,7 @@ from typing import Any, Literal
 
 from eagle_rl.config.yaml_file import write_yaml
 from eagle_rl.errors import CheckpointError, ConfigError
+from eagle_rl.paths import RUNS, misplaced
 from eagle_rl.runners.checkpoint import verify_checkpoint
 from eagle_rl.runners.files import write_atomically
 from eagle_rl.runners.plan import Stage
@@ -122,7 +123,7 @@ def _damage_in_words(path: Path) -> Iterator[None]:
 def _read_plan_file(run_dir: Path) -> dict[str, Any]:
     path = run_dir / "plan.json"
     if not path.exists():
-        raise CheckpointError(f"{run_dir}: not a run directory: it has no plan.json.")
+        raise CheckpointError(misplaced(run_dir, "not a run directory: it has no plan.json.", *RUNS))
     return json.loads(path.read_text(encoding="utf-8"))
 
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from rich.console import Console
@@ -17,19 +17,84 @@ from eagle_rl.config.schema import ExperimentCfg, ObservationsCfg, TaskCfg
 from eagle_rl.errors import CheckpointError
 from eagle_rl.models.actor import SIDED_GROUPS
 from eagle_rl.models.sides import MirrorMap, Sides
-from eagle_rl.runners.checkpoint import (
-    load_checkpoint,
-    load_correction,
-    require_whole,
-    save_checkpoint,
-    verify_checkpoint,
-)
+from eagle_rl.runners.checkpoint import Manifest, load_checkpoint, load_correction, require_whole, save_checkpoint
 from eagle_rl.runners.files import write_atomically
 from eagle_rl.runners.locate import find_checkpoint
 from eagle_rl.runners.provenance import Provenance, changes
 from eagle_rl.runners.published import SUFFIX
 
 _FIRST_LAYER = "mlp.0.weight"
+_SHAPING = {
+    "history": ("history_length", "last_action"),
+    "command": (),
+    "clock": ("clock_harmonics",),
+    "estimate": ("embodiment_observation", "descriptor"),
+}
+"""Keys of ``task.observations`` that the number of columns of a group depends on."""
+
+
+class Root(NamedTuple):
+    """What an experiment starts from."""
+
+    source: Path
+    manifest: Manifest
+    task: TaskCfg
+    """The task it was trained in."""
+    state: dict[str, Any]
+
+
+def open_root(cfg: ExperimentCfg, shown: Mapping[str, int] | None = None) -> Root:
+    """The checkpoint ``plan.root`` names, if training can go on from it.
+
+    Args:
+        cfg: the experiment.
+        shown: columns of its observation groups, if known.
+
+    Raises:
+        CheckpointError: no training can go on from it.
+    """
+    try:
+        source = find_checkpoint(Path(cfg.plan.root or ""))
+    except CheckpointError as error:
+        raise CheckpointError(f"plan.root: {error}") from error
+    if source.suffix == SUFFIX:
+        raise _no_critic(source, "a published policy")
+    checkpoint = load_checkpoint(source)
+    manifest, state = checkpoint.manifest, checkpoint.state
+    require_whole(source, manifest)
+    if load_correction(source) is not None:
+        raise CheckpointError(
+            f"plan.root: {source}: a corrected specialist, which no training can go on from: its correction is no part "
+            "of its network. Use the stage before the correction, or a generalist distilled from it."
+        )
+    if "critic_state_dict" not in state.get("algorithm", {}):
+        raise _no_critic(source, "a specialist that was given to its run")
+    task, seen = experiment_from_plain(manifest["config"], str(source)).task, state["architecture"]["observations"]
+    clock = min(seen["clock"], clock_columns(cfg.task.observations))  # fewer are widened
+    require_columns("plan.root", source, seen, {**(shown or {}), "clock": clock}, task.observations)
+    return Root(source, manifest, task, state)
+
+
+def require_columns(
+    setting: str, source: Path, seen: Mapping[str, int], shown: Mapping[str, int], was: ObservationsCfg
+) -> None:
+    """Refuse a policy that reads, or estimates, other observations than an experiment shows.
+
+    Args:
+        setting: where the policy was named.
+        source: its file.
+        seen: columns of the groups it was built for.
+        shown: columns of the experiment's groups, those that matter.
+        was: observations of the experiment it was trained in.
+
+    Raises:
+        CheckpointError: it does; names the settings to add.
+    """
+    wrong = [group for group in shown if shown[group] != seen[group]]
+    if wrong:
+        faults = ", ".join(f"{seen[group]} columns of {group}, not {shown[group]}" for group in wrong)
+        remedy = " ".join(f"task.observations.{key}={getattr(was, key)}" for group in wrong for key in _SHAPING[group])
+        raise CheckpointError(f"{setting}: {source}: sees {faults} as this experiment shows. Add {remedy}.")
 
 
 def take_root(
@@ -52,22 +117,9 @@ def take_root(
         first: whether this is the first of several data-parallel processes; the others leave reports to it.
 
     Raises:
-        CheckpointError: no training can go on from it.
+        CheckpointError: as :func:`open_root`.
     """
-    source = find_checkpoint(Path(cfg.plan.root or ""))
-    if source.suffix == SUFFIX:
-        raise _no_critic(source, "a published policy")
-    manifest = verify_checkpoint(source)
-    require_whole(source, manifest)
-    if load_correction(source) is not None:
-        raise CheckpointError(
-            f"plan.root: {source}: a corrected specialist, which no training can go on from: its correction is no part "
-            "of its network. Use the stage before the correction, or a generalist distilled from it."
-        )
-    was = experiment_from_plain(manifest["config"], str(source)).task
-    state = load_checkpoint(source).state
-    if "critic_state_dict" not in state["algorithm"]:
-        raise _no_critic(source, "a specialist that was given to its run")
+    source, manifest, was, state = open_root(cfg)
     symmetric, was_symmetric = cfg.algo.network.symmetric, bool(state.get("architecture", {}).get("mirror"))
     if first:
         tell_changed_meaning(

@@ -21,7 +21,7 @@ from eagle_rl.evaluation.evaluate import MakeEnv
 from eagle_rl.runners.plan import plan_stages
 from eagle_rl.runners.provenance import Provenance
 from eagle_rl.runners.records import Record, active_stages, final_checkpoint, open_plan, read_record
-from eagle_rl.runners.teacher import open_teacher
+from eagle_rl.runners.sources import check_sources
 from eagle_rl.runners.team import Team
 from eagle_rl.runners.worker import Worker
 
@@ -71,9 +71,8 @@ def run_experiment(
         raise ConfigError(f"--jobs {jobs}: each of {team.size} data-parallel processes trains the same stage; use one.")
     now = dataclasses.replace(provenance or Provenance(), config=dataclasses.asdict(cfg))
     stages = plan_stages(cfg, team.size)
-    for stage in stages:
-        if stage.source and not resume:  # before anything is trained
-            open_teacher(cfg, stage, now)
+    if not resume:
+        check_sources(cfg, stages, now)
     provenance = team.agree(lambda: open_plan(run_dir, now, stages, resume=resume, allow_drift=allow_drift))
     allow_drift |= provenance.drifted  # its checkpoints may be from before
     worker = Worker(cfg, stages, run_dir, make_env, provenance, team, allow_drift, jobs)

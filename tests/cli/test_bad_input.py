@@ -128,7 +128,42 @@ def test_a_damaged_checkpoint_is_refused_by_name(refused, checkpoint, verb):
 
 @pytest.mark.parametrize("verb", USES, ids=" ".join)
 def test_where_no_checkpoint_is_it_is_said_so(refused, verb):
-    refused([*verb, "nowhere"], 5, "nowhere: no checkpoint there")
+    refused([*verb, "."], 5, ".: no checkpoint there")
+
+
+@pytest.mark.parametrize("verb", [*USES, ["plot", "rounds"], ["plot", "curves"], ["status"], ["sim2sim"]], ids=" ".join)
+def test_where_nothing_is_it_is_said_so_with_the_nearest_name(refused, verb):
+    more = ["--robot", "h1"] if verb == ["sim2sim"] else []
+    Path("none.pt").write_text("")
+    code = 2 if verb == ["plot", "curves"] else 5
+    refused([*verb, "nowhere", *more], code, "error: nowhere: no such folder.")
+    refused([*verb, "nope.pt", *more], code, "error: nope.pt: no such file. Did you mean none.pt?")
+
+
+@pytest.mark.parametrize("verb", [*USES, ["plot", "rounds"], ["plot", "curves"], ["status"], ["train", "--resume"]])
+def test_where_a_run_is_expected_the_runs_in_a_folder_are_listed_newest_first(refused, verb):
+    for age, name in enumerate("CADBE"):
+        run = Path("logs/smoke") / name
+        run.mkdir(parents=True)
+        (run / "plan.json").write_text("{}")
+        os.utime(run / "plan.json", (0, 10 - age))
+    for folder in ("logs", "logs/smoke"):
+        listed = ", ".join(f"logs/smoke/{name}" for name in "CADB")
+        refused([*verb, folder], 2 if verb[-1] == "curves" else 5, f"There, newest first: {listed} and 1 more.")
+
+
+def test_policies_in_a_folder_are_listed(refused):
+    Path("weights").mkdir()
+    Path("weights/mine.safetensors").write_text("")
+    refused(["play", "weights"], 5, "a NAME.safetensors", "newest first: weights/mine.safetensors")
+
+
+def test_other_files_than_a_verb_takes_are_refused_in_its_own_words(refused):
+    Path("mine.safetensors").write_bytes(b"\xb0" * 9)
+    refused(["plot", "curves", "mine.safetensors"], 2, "mine.safetensors: holds no curves. Name a run")
+    Path("mine.onnx").write_bytes(b"nothing")
+    refused(["sim2sim", ".", "--robot", "h1"], 5, ".: a folder, expected a file", "newest first: mine.onnx")
+    refused(["sim2sim", "mine.onnx", "--robot", "h1"], 5, "mine.onnx: cannot be opened as ONNX: Load model")
 
 
 @pytest.mark.parametrize(

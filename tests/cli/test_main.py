@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import subprocess
 import sys
 import types
@@ -13,6 +14,9 @@ import pytest
 
 from eagle_rl import errors
 from eagle_rl.cli import main as cli
+from eagle_rl.config.compose import known_names
+from eagle_rl.config.load import load_experiment
+from eagle_rl.paths import data_root
 
 
 @pytest.fixture
@@ -131,6 +135,31 @@ def test_a_verb_gets_the_words_after_it(verb):
 def test_an_unknown_verb_is_refused_with_the_nearest(capsys):
     assert cli.main(["trian"]) == 2
     assert "no verb 'trian'. Did you mean train?" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("words", [["--help"], ["--version"], ["status", "--help"]])
+def test_a_reader_who_leaves_is_no_fault(words):
+    reading, writing = os.pipe()
+    os.close(reading)
+    command = [sys.executable, "-m", "eagle_rl.cli.main", *words]
+    done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True, check=False, cwd=data_root())
+    os.close(writing)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("verb", cli.VERBS)
+def test_help_of_a_verb_is_plain_text(verb, capsys):
+    with pytest.raises(SystemExit, match="0"):
+        cli.main([verb, "--help"])
+    assert "``" not in capsys.readouterr().out
+
+
+def test_help_of_train_describes_every_experiment(capsys):
+    with pytest.raises(SystemExit, match="0"):
+        cli.main(["train", "--help"])
+    out = " ".join(capsys.readouterr().out.split())
+    for name in known_names("experiment"):
+        assert f"{name} {load_experiment(name).description}" in out
 
 
 @pytest.mark.parametrize("words", [[], ["--help"], ["-h"], ["help"]])

@@ -10,10 +10,13 @@ import pytest
 from PIL import Image
 
 from eagle_rl.cli import export, play, sim2sim
+from eagle_rl.cli.policy import load_policy
 from eagle_rl.cli.session import caption
 from eagle_rl.cli.window import KEYS, STOP, Keyboard
 from eagle_rl.config.schema import CommandsCfg
 from eagle_rl.errors import CheckpointError, ConfigError, RobotError
+from eagle_rl.export.onnx import export_onnx
+from eagle_rl.paths import data_root
 from envs.rendering.offscreen import gl_backends
 from envs.rendering.scene import default_qpos
 from envs.robots.load import load_robot
@@ -48,9 +51,11 @@ def test_a_video_and_a_contact_sheet_are_made_without_a_display(checkpoint, tmp_
 
 
 @needs_gl
-def test_without_a_display_and_without_options_the_video_lies_next_to_the_checkpoint(checkpoint):
+def test_without_a_display_and_without_options_the_video_lies_where_one_is(checkpoint, tmp_path):
+    before = sorted(checkpoint.parent.iterdir())
     assert play.main([str(checkpoint), "--robots", "t1", "--seconds", "0.1"]) == 0
-    assert checkpoint.with_suffix(".mp4").stat().st_size > 0
+    assert (tmp_path / checkpoint.with_suffix(".mp4").name).stat().st_size > 0
+    assert sorted(checkpoint.parent.iterdir()) == before, "a run's checkpoints are left alone"
 
 
 @pytest.mark.parametrize(
@@ -70,12 +75,27 @@ def test_wrong_words_are_answered_before_anything_is_filmed(checkpoint, words, e
     assert not list(tmp_path.iterdir())
 
 
-def test_without_a_checkpoint_the_newest_run_is_shown_and_none_is_said_so(tmp_path):
+@pytest.fixture
+def played(monkeypatch):
+    """What was to be filmed."""
+    found = []
+    monkeypatch.setattr(play, "_load", lambda args, checkpoint, seconds: found.append(checkpoint))
+    monkeypatch.setattr(play, "film", lambda *args: None)
+    return found
+
+
+def test_it_is_said_which_policy_is_played_the_published_one_or_that_of_the_newest_run(played, tmp_path, capsys):
     with pytest.raises(CheckpointError, match="make train"):
-        play.newest_run()
+        play.main(["--last"])
     for name in ("old", "new"):
-        untrained_checkpoint(tmp_path / "logs" / "ppo" / name / "stages" / "generalist" / "checkpoints", "h1")
-    assert play.newest_run().name == "new"
+        newest = untrained_checkpoint(tmp_path / "logs" / "ppo" / name / "checkpoints", "h1")
+    assert play.main([]) == play.main(["--last"]) == 0
+    assert [path.name for path in played] == [play.PUBLISHED.name, newest.name]
+    told = capsys.readouterr().err
+    assert "playing checkpoints/generalist.safetensors\n" in told
+    assert "playing logs/ppo/new/" in told
+    with pytest.raises(ConfigError, match="Give one of them"):
+        play.main(["--last", str(newest)])
 
 
 def test_without_viser_the_browser_view_says_what_to_install(checkpoint, monkeypatch):
@@ -155,7 +175,20 @@ def test_an_exported_policy_runs_in_plain_mujoco(checkpoint, tmp_path, capsys):
         sim2sim.main([str(policy), "--robot", "t1", "--physics-dt", "0.003"])
 
 
-def test_an_export_is_named_after_its_contract(checkpoint):
+def test_an_export_is_named_after_its_contract_and_lies_where_one_is(checkpoint, tmp_path):
     assert export.main([str(checkpoint)]) == 0
-    (found,) = checkpoint.parent.glob("model_1_*.onnx")
-    assert len(found.stem) == len("model_1_") + 8
+    (found,) = tmp_path.iterdir()
+    assert found.match("model_1_????????.onnx")
+    assert not list(checkpoint.parent.glob("*.onnx"))
+
+
+def test_a_robot_that_is_in_the_file_alone_is_asked_for_its_yaml(checkpoint, tmp_path, capsys):
+    policy = tmp_path / "p.onnx"
+    text = (data_root() / "cfg/robots/t1.yaml").read_text(encoding="utf-8").replace("name: t1", "name: mybot")
+    (tmp_path / "mine.yaml").write_text(text.replace("../../assets", str(data_root() / "assets")), encoding="utf-8")
+    loaded = load_policy(checkpoint)
+    export_onnx(loaded.actor, export.build_contract(loaded.cfg, loaded.sha256, ["mine.yaml"]), policy)
+    with pytest.raises(RobotError, match=r"mybot is in .*p\.onnx; plain MuJoCo needs its YAML too: --robot PATH"):
+        sim2sim.main([str(policy), "--robot", "mybot"])
+    with pytest.raises(RobotError, match="nobody"):
+        sim2sim.main([str(policy), "--robot", "nobody"])

@@ -12,6 +12,8 @@ import pytest
 from eagle_rl.cli.main import run_verb
 from eagle_rl.config.load import load_experiment
 from eagle_rl.paths import data_root
+from eagle_rl.runners.records import open_plan
+from tests.policy import untrained_checkpoint
 
 
 @pytest.fixture
@@ -21,6 +23,7 @@ def runs(monkeypatch):
 
     def run_experiment(cfg, run_dir, make_env, resume=False, *rest, **options):
         calls.append((cfg, run_dir, resume))
+        open_plan(run_dir, options["provenance"], [], resume=resume)
         return types.SimpleNamespace(run_dir=run_dir, generalist=None, records={})
 
     module = types.ModuleType("eagle_rl.runners.stages")
@@ -91,7 +94,9 @@ def test_resume_refuses_another_experiment(runs, capsys):
         (("pppo",), 2, "Did you mean ppo?"),
         (("ppo", "algo.gama=1"), 2, "Did you mean gamma?"),
         (("ppo", "robots=[g2]"), 3, "no robot named 'g2'. Did you mean g1?"),
-        (("--resume", "nowhere"), 5, "not a run directory"),
+        (("--resume", "nowhere"), 5, "nowhere: no such folder"),
+        (("fork_ppo", "plan.root=nope.pt"), 5, "plan.root: nope.pt: no such file"),
+        (("quickstart", "robots=[h1]", "plan.teachers=[nope.pt]"), 5, "plan.teachers: got 'nope.pt'"),
         (("ppo", "--resume", ".", "--scale", "paper"), 2, "keeps the scale"),
     ],
 )
@@ -100,6 +105,37 @@ def test_bad_input_is_refused_in_words_and_leaves_nothing(runs, words, code, mes
     assert message in capsys.readouterr().err
     assert not runs
     assert not list(Path().iterdir())
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("fork_ppo", "plan.root={}"), "has no critic to go on from"),
+        (("quickstart", "robots=[t1]", "plan.teachers=[{}]"), "a policy of h1, expected one of t1"),
+        (
+            ("quickstart", "robots=[h1]", "plan.teachers=[{}]", "task.observations.clock_harmonics=5"),
+            "sees 2 columns of clock, not 20 as this experiment shows. Add task.observations.clock_harmonics=0.",
+        ),
+    ],
+)
+def test_a_file_nothing_can_be_made_of_is_refused_before_tables_and_folders(runs, tmp_path, words, message, capsys):
+    path = untrained_checkpoint(tmp_path / "files", "h1")
+    assert train(*(word.format(path) for word in words)) == 5
+    told = capsys.readouterr()
+    assert message in told.err
+    assert told.out == ""
+    assert not runs
+    assert [entry.name for entry in tmp_path.iterdir()] == ["files"]
+
+
+def test_a_resume_that_is_refused_prints_no_tables(runs, capsys):
+    train("smoke")
+    capsys.readouterr()
+    assert train("--resume", str(runs[0][1]), "algo.gamma=0.5") == 2
+    told = capsys.readouterr()
+    assert "changed since the run was begun" in told.err
+    assert told.out == ""
+    assert train("--resume", str(runs[0][1]), "algo.gamma=0.5", "--allow-drift") == 0
 
 
 def test_a_missing_urdf_is_a_robots_fault_and_leaves_nothing(runs, tmp_path, capsys):

@@ -123,6 +123,17 @@ def test_protocols_are_compared_before_anything_is_judged(tmp_path, monkeypatch)
     assert not (tmp_path / "out").exists()
 
 
+def test_what_is_going_to_be_judged_is_announced_with_what_is_quicker(run, tmp_path, capsys):
+    assert main([f"PPO={run.run_dir}", *QUICK]) == 0
+    assert "PPO: judging 1 robot x 2 environments x 10 steps\n" in capsys.readouterr().err
+    full = evaluate.announcement("PPO", EvaluationCfg(), ("h1", "g1"))
+    assert full == "PPO: judging 2 robots x 256 environments x 1000 steps (--envs 32 is quicker)"
+
+
+def test_the_published_size_is_judged_as_the_paper_does():
+    assert load_experiment("ppo", scale="paper").evaluation.num_envs_per_robot == 2048
+
+
 def test_what_has_been_judged_is_kept_whatever_comes_next(tmp_path, monkeypatch):
     def judge(method, trial, console):
         if method == "B":

@@ -60,7 +60,7 @@ def test_two_paths_of_one_name_are_refused(tmp_path, figure):
 
 
 def test_a_folder_that_is_no_run_is_refused(tmp_path):
-    with pytest.raises(ConfigError, match="no such file"):
+    with pytest.raises(ConfigError, match="no numbers of training there"):
         main(["curves", str(tmp_path)])
 
 

@@ -18,6 +18,7 @@ from eagle_rl.evaluation import plots
 from eagle_rl.evaluation.estimator import Channel, Moments, Sampled, judge_estimator, report
 from eagle_rl.evaluation.estimator_report import describe, to_csv, to_markdown
 from tests.evaluation.fake import ScriptedEnv, idle
+from tests.runners.toy_run import refuse
 
 SPEED = Channel(name="base v_x", unit="m/s", scale=0.5)
 MASS = Channel(name="torso mass", unit="kg", scale=4.0)
@@ -77,6 +78,19 @@ def test_a_target_that_does_not_vary_has_no_explained_variance():
     found = report({"a": sampled(target + 0.1, target)}, (SPEED, MASS))
     assert found.within[0].explained is None
     assert "| base v_x | - | - | - |" in to_markdown(found, "")
+
+
+def test_what_varies_too_little_to_matter_in_the_loss_is_not_explained_and_other_numbers_stay():
+    target = torch.cat((spread(0.0, 0.09)[:, :1], spread(0.0, 0.11)[:, :1]), dim=1)
+    little, enough = report({"a": sampled(target + 9.0 * target, target)}, (SPEED, MASS)).within
+    assert little.explained is None
+    assert enough.explained == pytest.approx(1.0 - 9.0**2)
+    assert (little.prior, little.rmse) == pytest.approx((0.5 * 0.09, 0.5 * 9 * 0.09))
+
+
+def test_too_few_steps_for_a_sample_are_refused_with_the_number_that_will_do():
+    with pytest.raises(ConfigError, match=r"--steps 50 is 1 s; sampling begins after 1 s, give at least 51\."):
+        judge_estimator(HalfBlind(), refuse, ["a"], TaskCfg(), EvaluationCfg(num_steps=50), (SPEED, MASS))
 
 
 def test_nobody_left_standing_is_an_error_in_words():

@@ -127,6 +127,30 @@ def test_the_lowest_error_of_each_robot_is_bold_and_floors_never_are():
     assert "**" not in lines["best constant"]
 
 
+def test_only_notes_that_apply_stand_under_a_table():
+    plain = tracking_table({"mine": [result((0.1,) * 5)]})
+    runs = {
+        "A": [result((0.1,) * 5, seed=1, unseen=("h1",)), result((0.3,) * 5, seed=2)],
+        "EAGLE": [result((0.2,) * 5)],
+    }
+    full = tracking_table(runs)
+    for note in ("Bold", "In brackets", "±", "Unseen"):
+        assert note not in to_markdown(plain), note
+        assert note in to_markdown(full), note
+    assert "millions of environment steps" in to_markdown(plain)
+    assert "In brackets" not in to_latex(plain)
+    assert "In brackets" in to_latex(full)
+
+
+@pytest.mark.parametrize(
+    ("protocol", "told"),
+    [("single", "four commands zero, the other drawn from the"), ("joint", "all five commands drawn from the")],
+)
+def test_the_caption_says_what_is_drawn_from_the_finishing_ranges(protocol, told):
+    ev = dataclasses.replace(EV, protocol=protocol)
+    assert f"{told} finishing ranges" in tracking_table({"PPO": [result((0.1,) * 5, ev=ev)]}).caption
+
+
 def test_a_subset_without_steps_shows_a_dash():
     table = tracking_table({"PPO": [result((None,) * 5)]}, falls="errors")
     assert "| - [0.108] |" in to_markdown(table)

@@ -29,7 +29,9 @@ def test_a_stage_means_its_latest_checkpoint(run):
 
 def test_files_mean_themselves(run, tmp_path):
     assert find_checkpoint(run.generalist.with_suffix(".json")) == run.generalist
-    assert find_checkpoint(tmp_path / "policy.safetensors") == tmp_path / "policy.safetensors"
+    published = tmp_path / "policy.safetensors"
+    published.write_text("")
+    assert find_checkpoint(published) == find_checkpoint(published.with_suffix(".json")) == published
 
 
 def test_a_folder_without_checkpoints_is_refused_in_words(tmp_path):

@@ -12,10 +12,10 @@ from eagle_rl.models.actor import ACTOR_INPUTS
 from eagle_rl.runners.checkpoint import load_actor, load_checkpoint
 from eagle_rl.runners.plan import plan_stages
 from eagle_rl.runners.records import final_checkpoint
-from eagle_rl.runners.root import clock_columns, widen_clock
+from eagle_rl.runners.root import clock_columns, open_root, widen_clock
 from eagle_rl.runners.stages import run_experiment
 from eagle_rl.runners.training import train
-from tests.runners.toy_run import ENVS, make_toy_env, toy_experiment, toy_job
+from tests.runners.toy_run import ENVS, make_toy_env, refuse, toy_experiment, toy_job
 
 
 def with_harmonics(cfg, count):
@@ -98,8 +98,18 @@ def test_of_several_processes_the_first_alone_writes_a_root_that_is_changed(root
 def test_a_root_that_saw_more_of_the_clock_is_refused(root, tmp_path):
     wide = run_experiment(continued(root, method="ppo"), tmp_path / "wide", make_toy_env).generalist
     cfg = toy_experiment(iterations=1, judge_envs=0, method="ppo", root=str(wide))
-    with pytest.raises(CheckpointError, match="expected"):
-        run_experiment(cfg, tmp_path / "run", make_toy_env)
+    told = r"plan\.root: .* sees 12 columns of clock, not 2 as .* Add task\.observations\.clock_harmonics=3\."
+    with pytest.raises(CheckpointError, match=told):
+        run_experiment(cfg, tmp_path / "run", refuse)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_root_that_estimates_or_reads_something_else_is_refused(root):
+    cfg = continued(root, method="ppo")
+    seen = load_actor(root)[0].architecture["observations"]
+    open_root(cfg, seen | {"clock": 12})  # fewer columns of it are widened
+    with pytest.raises(CheckpointError, match=f"sees {seen['estimate']} columns of estimate, not 1 as"):
+        open_root(cfg, seen | {"estimate": 1})
 
 
 def symmetric(cfg):
