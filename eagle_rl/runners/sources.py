@@ -31,7 +31,7 @@ def check_sources(
         open_root(cfg, shown)
     for stage in stages:
         if stage.source is not None:
-            source, actor, manifest = open_teacher(cfg, stage, provenance.slot_table_hash)
+            source, actor, manifest = open_teacher(cfg, stage, provenance)
             was = experiment_from_plain(manifest["config"], str(source)).task.observations
             read = {group: shown[group] for group in ACTOR_INPUTS} if shown else {}
             require_columns("plan.teachers", source, actor.architecture["observations"], read, was)
