@@ -15,7 +15,7 @@ from eagle_rl.runners.checkpoint import Manifest, load_actor, load_correction, r
 from eagle_rl.runners.locate import find_checkpoint
 from eagle_rl.runners.plan import TEACHERS, Stage
 from eagle_rl.runners.provenance import Provenance
-from eagle_rl.runners.root import tell_changed_meaning
+from eagle_rl.runners.root import require_columns, tell_changed_meaning
 
 
 def open_teacher(cfg: ExperimentCfg, stage: Stage, provenance: Provenance) -> tuple[Path, EagleActor, Manifest]:
@@ -68,17 +68,9 @@ def take_teacher(
     path = checkpoints / "model_0.pt"
     if first:
         source, actor, manifest = open_teacher(cfg, stage, provenance)
-        seen, shown = actor.architecture["observations"], sizes()
-        faults = [
-            f"{seen[group]} columns of {group}, not {shown[group]}"
-            for group in ACTOR_INPUTS
-            if seen[group] != shown[group]
-        ]
-        if faults:
-            raise CheckpointError(
-                f"plan.teachers: {source}: sees {', '.join(faults)} as this experiment shows (task.observations)."
-            )
-        was = experiment_from_plain(manifest["config"], str(source)).task
+        was, columns = experiment_from_plain(manifest["config"], str(source)).task, sizes()
+        shown = {group: columns[group] for group in ACTOR_INPUTS}
+        require_columns("plan.teachers", source, actor.architecture["observations"], shown, was.observations)
         tell_changed_meaning("plan.teachers", source, was, cfg.task)
         correction = load_correction(source)
         state = {
