@@ -156,8 +156,8 @@ class PlanCfg:
     distill_env_steps: int = 0
     """Budget of each distillation, per round."""
     start_share: float = 0.0
-    """Share of the weights a round started from in those it ends with; the rest are the distilled ones. Halves of both
-    follow as well as the latter and fall less when disturbed (ours; docs/experiments.md, 20)."""
+    """Share of the weights a round, or a root that PPO goes on with, started from in those it ends with. Halves of both
+    ends follow as well as the new one and fall less when disturbed (ours; docs/experiments.md, 20 and 37)."""
     base_env_steps: int = 0
     """Budget of COMPASS's base policy, which imitates the root; 0 makes the root itself its base."""
     max_rounds: int = 1

@@ -269,6 +269,8 @@ def _method_faults(cfg: ExperimentCfg) -> Iterator[Fault]:
     if method in ("eagle", "kickstarting"):
         return
     unused = {f"plan.{key}": getattr(plan, key) for key in _OF_ROUNDS} | {"algo.use_ppo_loss": cfg.algo.use_ppo_loss}
+    if method == "ppo" and plan.root is not None:
+        del unused["plan.start_share"]
     defaults = dict(leaves(ExperimentCfg(name=cfg.name)))
     for path, value in unused.items():
         if value != defaults[path]:

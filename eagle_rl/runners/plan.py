@@ -230,6 +230,8 @@ def plan_stages(cfg: ExperimentCfg, processes: int = 1) -> list[Stage]:
     if plan.method == "ppo":
         if plan.root is not None:
             stages.append(_stage(cfg, "continued", "continued", plan.generalist_env_steps, init="root"))
+            if plan.start_share:
+                stages.append(_stage(cfg, "averaged", "average", 0, init="continued", start="root"))
         return stages
     if plan.method == "compass":
         return [*stages, *_compass(cfg, stages[0].name)]

@@ -283,6 +283,19 @@ def test_the_run_is_complete_without_its_root(finished, tmp_path):
     assert read_record(result.run_dir, "continued").inputs == {"root": result.records["root"].sha256}
 
 
+def test_what_goes_on_from_a_root_may_end_between_both(finished, tmp_path):
+    root = finished.run_dir / finished.records["generalist"].checkpoint
+    cfg = toy_experiment(iterations=1, judge_envs=0, method="ppo", root=str(root), start_share=0.25)
+    result = run_experiment(cfg, tmp_path / "run", make_toy_env)
+    start, continued, average = (
+        load_actor(final_checkpoint(result.run_dir, name))[0].state_dict() for name in ("root", "continued", "averaged")
+    )
+    assert result.generalist == final_checkpoint(result.run_dir, "averaged")
+    for name, x in average.items():
+        torch.testing.assert_close(x, 0.25 * start[name] + 0.75 * continued[name], msg=name)
+    assert any(not torch.equal(start[name], continued[name]) for name in start)
+
+
 def test_a_round_may_end_between_where_it_started_and_what_was_distilled(tmp_path):
     cfg = toy_experiment(iterations=1, start_share=0.25)
     result = run_experiment(cfg, tmp_path / "run", make_toy_env)
