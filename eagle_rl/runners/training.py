@@ -146,6 +146,7 @@ def _average(job: Job) -> Path:
         assert job.init is not None, "an average has an end"
         assert job.start is not None, "and a start"
         end, start = (load_checkpoint(path).state for path in (job.init, job.start))
+        end.pop("processes", None)  # its environments, in which nobody goes on: an average is not trained
         learner, weights = end["algorithm"], start["algorithm"]["actor_state_dict"]
         share = job.cfg.plan.start_share
         actor = {name: torch.lerp(x, weights[name], share) for name, x in learner["actor_state_dict"].items()}

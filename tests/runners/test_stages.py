@@ -291,6 +291,7 @@ def test_what_goes_on_from_a_root_may_end_between_both(finished, tmp_path):
         load_actor(final_checkpoint(result.run_dir, name))[0].state_dict() for name in ("root", "continued", "averaged")
     )
     assert result.generalist == final_checkpoint(result.run_dir, "averaged")
+    assert "processes" not in load_checkpoint(result.generalist).state, "no environments go on from an average"
     for name, x in average.items():
         torch.testing.assert_close(x, 0.25 * start[name] + 0.75 * continued[name], msg=name)
     assert any(not torch.equal(start[name], continued[name]) for name in start)
