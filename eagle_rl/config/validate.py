@@ -22,7 +22,6 @@ _POSITIVE: _Bound = ("above 0", lambda x: x > 0)
 _NOT_NEGATIVE: _Bound = ("0 or more", lambda x: x >= 0)
 _SHARE: _Bound = ("from 0 to 1", lambda x: 0 <= x <= 1)
 _POSITIVE_SHARE: _Bound = ("above 0 and at most 1", lambda x: 0 < x <= 1)
-_OPEN_SHARE: _Bound = ("above 0 and below 1", lambda x: 0 < x < 1)
 
 _WEIGHTS = "task.rewards.weights."
 
