@@ -30,12 +30,22 @@ class Attribute(NamedTuple):
     """From the owner, e.g. ``commands.command``."""
     kind: type | None
     """The dataclass; None for a tensor."""
+    holder: Callable[[object], object]
+    """Finds whose attribute it is, given the owner."""
+    name: str
+    """By which that has it."""
+
+    @classmethod
+    def at(cls, path: str, kind: type | None = None) -> Attribute:
+        """The attribute that is found there."""
+        way, _, name = path.rpartition(".")
+        return cls(path, kind, attrgetter(way) if way else _itself, name)
 
     @classmethod
     def of(cls, owner: object, path: str) -> Attribute:
         """The attribute as it is now."""
         value = attrgetter(path)(owner)
-        return cls(path, type(value) if is_dataclass(value) else None)
+        return cls.at(path, type(value) if is_dataclass(value) else None)
 
     def paths(self) -> list[str]:
         """Of its tensors."""
@@ -44,8 +54,7 @@ class Attribute(NamedTuple):
     def put(self, owner: object, tensors: Iterator[Tensor | None]) -> None:
         """Set it to the next of these tensors, as many as it takes."""
         value = next(tensors) if self.kind is None else self.kind(**{f.name: next(tensors) for f in fields(self.kind)})
-        *way, name = self.path.split(".")
-        setattr(attrgetter(".".join(way))(owner) if way else owner, name, value)
+        setattr(self.holder(owner), self.name, value)
 
 
 class Recording:
@@ -159,7 +168,7 @@ class _Replay:
         writes: Sequence[str],
         scratch: Sequence[str],
     ) -> None:
-        self._owner, self._scratch = owner, [Attribute(path, None) for path in scratch]
+        self._owner, self._scratch = owner, [Attribute.at(path) for path in scratch]
         self._reads = [Attribute.of(owner, path) for path in reads]
         self._writes = [Attribute.of(owner, path) for path in writes]
         self._returned: tuple[type, tuple[bool, ...]] = (tuple, ())
@@ -180,12 +189,16 @@ class _Replay:
         self._kernel = kernels.compile_graph(self.graph, [inputs[i] for i in used])
         kept = [i for i in range(len(given)) if i < len(args) or i in used or i in passed]
         self._collect = _getter([paths[i - len(args)] for i in kept[len(args) :]])
-        self._inputs = [(kept.index(i), inputs[i].dtype) for i in used]
+        self._used = [kept.index(i) for i in used]
+        self._dtypes = [inputs[i].dtype for i in used]
         self._passed = [None if source is None else kept.index(source) for source in passed]
 
     def __call__(self, *args: Tensor) -> Any:
         given = (*args, *self._collect(self._owner))
-        made = iter(self._kernel(*(_fit(given[i], dtype) for i, dtype in self._inputs)))
+        inputs = [given[i] for i in self._used]
+        if not all(map(Tensor.is_contiguous, inputs)) or [x.dtype for x in inputs] != self._dtypes:
+            inputs = [x.to(dtype).contiguous() for x, dtype in zip(inputs, self._dtypes, strict=True)]
+        made = iter(self._kernel(*inputs))
         results = (next(made) if source is None else given[source] for source in self._passed)
         for attribute in self._writes:
             attribute.put(self._owner, results)
@@ -219,12 +232,12 @@ class _Replay:
         finally:
             _Replay.in_the_making = False
             for attribute, value in zip(attributes, before, strict=True):
-                Attribute(attribute.path, None).put(self._owner, iter([value]))
+                setattr(attribute.holder(self._owner), attribute.name, value)
 
 
-def _fit(x: Tensor, dtype: torch.dtype) -> Tensor:
-    """As the kernel was promised it."""
-    return x if x.dtype is dtype and x.is_contiguous() else x.to(dtype).contiguous()
+def _itself(owner: object) -> object:
+    """Whose attribute has no dot in its path."""
+    return owner
 
 
 def _getter(paths: Sequence[str]) -> Callable[[object], tuple[Any, ...]]:

@@ -124,7 +124,7 @@ class PhysicsPool:
 
     def advance(self, targets: Tensor, wrench: Tensor | None = None) -> None:
         """Nothing but physics, under what :meth:`aim` returned; :meth:`stage` follows."""
-        native = targets.cpu().numpy()
+        native = targets.numpy(force=True)
         forces = None if wrench is None else wrench.to("cpu", torch.float64).numpy()
         aimed = ~self.wild.cpu().numpy()[:, None] if self.any_wild else None
         after = self._readings[self._recorder.next()]
