@@ -38,7 +38,7 @@ def make_env(
     """An environment in the middle of training: everything randomized, episodes of all ages, steps compiled."""
     env: HumanoidEnv = make_env_factory(cfg.run)(robots or cfg.robots, num_envs, cfg.task, SEED)
     torch.manual_seed(SEED)
-    env.episode_length_buf = torch.randint(0, env.max_episode_length, (num_envs,))
+    env.stagger()
     if compiled:
         env.compile()
     return env

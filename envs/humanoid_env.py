@@ -45,6 +45,9 @@ from .step_log import StepLog, episode_ratio
 
 Pooling = Literal["mean", "max"]
 
+STAGGER = 20
+"""Control steps between those at which the time limits of staggered episodes are met."""
+
 
 class HumanoidEnv(ControlStep, VecEnv):
     """Whole-body command tracking by a mixed fleet of humanoids.
@@ -133,7 +136,7 @@ class HumanoidEnv(ControlStep, VecEnv):
         n, device = self.num_envs, self.device
         self._live = self.robots.slot_mask > 0
         self._all = torch.arange(n, device=device)
-        self.common_step_counter = 0
+        self.common_step_counter, self._stagger = 0, 1
         self._step_count = torch.zeros((), dtype=torch.long, device=device)
         self.episode_length_buf = torch.zeros(n, dtype=torch.long, device=device)
         self.episode_count = torch.zeros(n, dtype=torch.long, device=device)
@@ -204,6 +207,16 @@ class HumanoidEnv(ControlStep, VecEnv):
         if from_step is None:
             compile_step(self)
 
+    def stagger(self) -> None:
+        """Give episodes ages drawn by torch's generator, so that not all end at once, but always several together.
+
+        A reset takes as long for eight environments as for one. So time limits are met only at every
+        ``STAGGER``-th control step, for which an episode that follows a fall is a little shorter.
+        """
+        self._stagger = max(1, min(STAGGER, self.max_episode_length // 50))
+        groups = torch.randint_like(self.episode_length_buf, self.max_episode_length // self._stagger)
+        self.episode_length_buf = self._age_at_start() + self._stagger * groups
+
     def reset(self) -> None:
         """Start new episodes everywhere; random streams go on."""
         self._forget()
@@ -247,6 +260,10 @@ class HumanoidEnv(ControlStep, VecEnv):
         ids = where.nonzero().squeeze(1)
         return {"final_ids": ids, "final_observations": self.get_observations()[ids]}
 
+    def _age_at_start(self) -> int:
+        """Control steps that an episode which begins now is taken to have lasted, see :meth:`stagger`."""
+        return self.common_step_counter % self._stagger
+
     def _weigh(self) -> None:
         """Weight the reward terms as the penalties' curriculum has it."""
         self._reward_factors = reward_factors(self.task.rewards.weights, self.penalty_scale, self.step_dt, self.phase)
@@ -280,7 +297,7 @@ class HumanoidEnv(ControlStep, VecEnv):
             self.randomizer.put(ids, begun.draws)
         self.pool.place(ids, self.ground.place(ids, count, begun.root), begun.joint_pos, begun.joint_vel)
         self.episode_count[ids] += 1
-        self.episode_length_buf = self.episode_length_buf.index_fill(0, ids, 0)
+        self.episode_length_buf = self.episode_length_buf.index_fill(0, ids, self._age_at_start())
         self.phase = self.phase.index_fill(0, ids, 0.0)
         self.commands.renew(ids, fallen, begun.commands)
         self.posture.reset(ids)
@@ -330,13 +347,14 @@ class HumanoidEnv(ControlStep, VecEnv):
         """Everything a resumed run needs to go on bit for bit (tensors and numbers only)."""
         return {
             "common_step_counter": self.common_step_counter,
+            "stagger": self._stagger,
             "buffers": {name: getattr(self, name).clone() for name in self._BUFFERS},
             "history": self.history.frames.clone(),
         } | {name: getattr(self, name).state_dict() for name in self._PARTS}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`state_dict` returned, in an environment built from the same configuration and seed."""
-        self.common_step_counter = state["common_step_counter"]
+        self.common_step_counter, self._stagger = state["common_step_counter"], state["stagger"]
         self._step_count = torch.full_like(self._step_count, self.common_step_counter)
         self._weigh()
         for name in self._BUFFERS:

@@ -91,6 +91,9 @@ class ToyEnv(VecEnv):
         extras = {"time_outs": time_outs, "log": log, "final_ids": final_ids, "final_observations": final}
         return self.get_observations(), -error, time_outs | falls, extras
 
+    def stagger(self) -> None:
+        self.episode_length_buf = torch.randint_like(self.episode_length_buf, EPISODE_LENGTH)
+
     def reset(self) -> None:
         self._reset(torch.arange(self.num_envs))
 

@@ -118,8 +118,7 @@ class EagleRunner(OnPolicyRunner):
         """
         last = self.current_learning_iteration + num_learning_iterations
         if init_at_random_ep_len and self.current_learning_iteration == 0:
-            ages = torch.randint_like(self.env.episode_length_buf, high=int(self.env.max_episode_length))
-            self.env.episode_length_buf = ages
+            self.env.stagger()
         self.alg.train_mode()
         self._obs = self.env.get_observations().to(self.device)
         self.logger.open(self.current_learning_iteration + 1)

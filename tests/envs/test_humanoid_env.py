@@ -232,6 +232,30 @@ def test_a_full_episode_lasts_a_thousand_steps() -> None:
     assert env.step(actions(1, 1, 0.0))[3]["time_outs"].all()
 
 
+def test_staggered_episodes_end_at_different_times_but_together_with_others_even_after_falls() -> None:
+    task = replace(BARE, terminations=TerminationsCfg(episode_length_s=3.0))  # 150 steps
+    env = make_env(["h1"], num_envs=12, task=task)
+    torch.manual_seed(1)
+    env.stagger()
+    assert env.episode_length_buf.unique().numel() > 5, "they are to end at different times"
+    began, lengths, met = -env.episode_length_buf, [], set()
+    for step in range(1, 400):
+        if step % 37 == 0:
+            topple(env, step % 12)
+        _, _, dones, extras = env.step(actions(12, step, 0.0))
+        over = extras["time_outs"]
+        met |= {step % 3} if over.any() else set()
+        lengths += (step - began)[over].tolist()
+        began = torch.where(dones, step, began)
+        assert torch.equal(env.episode_length_buf, torch.where(dones, step % 3, env.episode_length_buf))
+    assert len(met) == 1, f"time limits were met at steps that are {met} modulo 3"
+    assert min(lengths) >= 148
+    assert max(lengths) == 150
+    again = make_env(["h1"], num_envs=12, task=task)
+    again.load_state_dict(env.state_dict())
+    assert again._stagger == env._stagger == 3, "a resumed run goes on alike"
+
+
 def test_actions_in_absent_slots_change_nothing() -> None:
     plain, noisy = make_env(), make_env()
     absent = noisy.robots.slot_mask == 0
