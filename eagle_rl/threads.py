@@ -58,10 +58,11 @@ class Threads:
     over and to take back, and after physics, which empties the caches, a tenth of a millisecond more.
     """
 
-    def __init__(self, count: int, name: str) -> None:
-        """Be so many; the others are called ``name``."""
+    def __init__(self, count: int, name: str, prepare: Callable[[], object] = lambda: None) -> None:
+        """Be so many; the others are called ``name``, and begin with ``prepare``."""
         self.count = count
         self._name = name
+        self._prepare = prepare
         self._inbox: _Inbox | None = None
         self._process = 0
         self._others: list[threading.Thread] = []
@@ -114,7 +115,7 @@ class Threads:
         if self._inbox is None or self._process != os.getpid():
             self._inbox, self._process = SimpleQueue(), os.getpid()
             self._others = [
-                threading.Thread(target=_serve, args=(self._inbox,), name=self._name, daemon=True)
+                threading.Thread(target=_serve, args=(self._inbox, self._prepare), name=self._name, daemon=True)
                 for _ in range(self.count - 1)
             ]
             for other in self._others:
@@ -123,9 +124,10 @@ class Threads:
         return self._inbox
 
 
-def _serve(inbox: _Inbox) -> None:
+def _serve(inbox: _Inbox, prepare: Callable[[], object]) -> None:
     """Take part in whatever comes, until dismissed."""
     torch.get_num_threads()  # asked for it, torch sets it in the thread that asks; some of its libraries do not ask
+    prepare()
     while (errand := inbox.get()) is not None:
         errand.join()
         del errand  # and what it holds

@@ -319,12 +319,12 @@ _PARTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         (
             *_STATE,
             *("pool.native", "pool.conventions", "pool.damping", "pool.clock", "pool.wild"),
-            *("episode_length_buf", "_last_frame", "history.frames", "randomizer.latency", "embodiment"),
+            *("episode_length_buf", "_last_frame", "history.flat", "randomizer.latency", "embodiment"),
             *("_step_count", "_noise", "_noise_keys", "_gait_shaping", "_reward_factors", *_FOLLOWED),
         ),
         (
             *("pool.staged", "pool.staged_before", "pool.causes", "pool.clock", "episode_length_buf", "phase"),
-            *("_last_frame", "_step_count", "history.frames", *_FOLLOWED),
+            *("_last_frame", "_step_count", "history.flat", *_FOLLOWED),
         ),
     ),
     "_derive_groups": ((*_STATE, "_last_frame", "embodiment"), ()),

@@ -136,6 +136,7 @@ class HumanoidEnv(ControlStep, VecEnv):
         n, device = self.num_envs, self.device
         self._live = self.robots.slot_mask > 0
         self._all = torch.arange(n, device=device)
+        self._nobody = self._all[:0]
         self.common_step_counter, self._stagger = 0, 1
         self._step_count = torch.zeros((), dtype=torch.long, device=device)
         self.episode_length_buf = torch.zeros(n, dtype=torch.long, device=device)
@@ -221,7 +222,7 @@ class HumanoidEnv(ControlStep, VecEnv):
         """Start new episodes everywhere; random streams go on."""
         self._forget()
         self.pool.staged = self.pool.staged.clone()  # what was handed out keeps its values
-        self.history.frames = self.history.frames.clone()
+        self.history.flat = self.history.flat.clone()
         self._reset(self._all, torch.zeros_like(self._all, dtype=torch.bool))
 
     def get_observations(self) -> TensorDict:
@@ -256,7 +257,7 @@ class HumanoidEnv(ControlStep, VecEnv):
     def _final(self, where: Tensor, anywhere: bool) -> dict[str, Any]:
         """The environments, bool (N,), whose returns end here, and what is observed there before anything is reset."""
         if not anywhere:
-            return {"final_ids": self._all[:0], "final_observations": self._no_observations}
+            return {"final_ids": self._nobody, "final_observations": self._no_observations}
         ids = where.nonzero().squeeze(1)
         return {"final_ids": ids, "final_observations": self.get_observations()[ids]}
 
@@ -349,7 +350,7 @@ class HumanoidEnv(ControlStep, VecEnv):
             "common_step_counter": self.common_step_counter,
             "stagger": self._stagger,
             "buffers": {name: getattr(self, name).clone() for name in self._BUFFERS},
-            "history": self.history.frames.clone(),
+            "history": self.history.flat.clone(),
         } | {name: getattr(self, name).state_dict() for name in self._PARTS}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -359,7 +360,7 @@ class HumanoidEnv(ControlStep, VecEnv):
         self._weigh()
         for name in self._BUFFERS:
             setattr(self, name, state["buffers"][name].to(self.device, copy=True))
-        self.history.frames = state["history"].to(self.device, copy=True)
+        self.history.flat = state["history"].to(self.device, copy=True)
         for name in self._PARTS:
             getattr(self, name).load_state_dict(state[name])
         self._apply_aids()

@@ -88,8 +88,14 @@ class History:
 
     def __init__(self, num_envs: int, length: int, frame: Tensor) -> None:
         """Start with zeros, as wide as ``frame`` of shape (..., F); call :meth:`reset` before use."""
-        self.frames = frame.new_zeros(num_envs, length, frame.shape[-1])
+        self._length = length
+        self.flat = frame.new_zeros(num_envs, length * frame.shape[-1])
+        """The observation group "history", shape (N, K * F)."""
+
+    @property
+    def frames(self) -> Tensor:
         """Shape (N, K, F)."""
+        return self.flat.view(len(self.flat), self._length, -1)
 
     def push(self, *columns: Tensor) -> None:
         """Put a frame in front and drop the oldest; tensors handed out before keep their values.
@@ -97,17 +103,12 @@ class History:
         Args:
             columns: the frame's, side by side F of them, shape (N, ...) each.
         """
-        kept = self.flat[:, : -self.frames.shape[2]]
-        self.frames = torch.cat((*columns, kept), dim=1).view_as(self.frames)
+        width = self.flat.shape[1] // self._length
+        self.flat = torch.cat((*columns, self.flat[:, :-width]), dim=1)
 
     def reset(self, ids: Tensor, frame: Tensor) -> None:
         """Fill all K frames of some environments with their first frame, shapes (n,) and (n, F) (HugWBC 5)."""
-        self.frames[ids] = frame.unsqueeze(1).expand(-1, self.frames.shape[1], -1)
-
-    @property
-    def flat(self) -> Tensor:
-        """The observation group "history", shape (N, K * F)."""
-        return self.frames.flatten(1)
+        self.flat[ids] = frame.repeat(1, self._length)
 
 
 def command_observation(state: PooledState, cfg: ObservationsCfg) -> Tensor:

@@ -49,7 +49,7 @@ class RobotBatch:
         self._time: Array = self._batch.bind("time")
         self._warmstart: Array = self._batch.bind("qacc_warmstart")
         self._xfrc: Array = self._batch.bind("xfrc_applied")
-        self._base = int(model.jnt_bodyid[0])
+        self._base_wrench = self._xfrc[:, int(model.jnt_bodyid[0])]
         self.actuator_force: Array = self._batch.bind("actuator_force")
         self.sensordata: Array = self._batch.bind("sensordata")
         sizes = {"status": 1, "warning": self._batch.warning.shape[1], "sensordata": model.nsensordata, "time": 1}
@@ -117,7 +117,7 @@ class RobotBatch:
 
     def apply_base_wrench(self, wrench: Array) -> None:
         """Hold a world-frame force [N] and torque [N m] on every base until the next call, shape (n, 6) or (6,)."""
-        self._xfrc[:, self._base] = wrench
+        self._base_wrench[:] = wrench
 
     def set_base_damping(self, damping: Array) -> None:
         """Set the damping of every base's rotation [N m s/rad], shape (n,)."""

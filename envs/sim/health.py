@@ -98,10 +98,11 @@ class FlightRecorder:
 
     def __init__(self, num_envs: int, width: int, dtype: torch.dtype, pin_memory: bool = False) -> None:
         """Start empty; memory from which a GPU reads is pinned."""
-        self._tensors = torch.zeros(self.LENGTH, num_envs, width, dtype=dtype, pin_memory=pin_memory)
-        self._rows: Array = self._tensors.numpy()
-        self._age = np.zeros(num_envs, dtype=np.int64)
-        self._latest = 0
+        rows = torch.zeros(self.LENGTH, num_envs, width, dtype=dtype, pin_memory=pin_memory)
+        self._tensors = rows.unbind()
+        self._rows: Array = rows.numpy()
+        self._began = np.zeros(num_envs, dtype=np.int64)
+        self._steps = self._latest = 0
 
     @property
     def latest(self) -> Array:
@@ -120,15 +121,15 @@ class FlightRecorder:
 
     def next(self) -> int:
         """Which of ``all`` is to be written in a new step: the oldest."""
-        self._latest = (self._latest + 1) % self.LENGTH
-        self._age += 1
+        self._steps += 1
+        self._latest = self._steps % self.LENGTH
         return self._latest
 
     def forget(self, envs: NDArray[np.int64] | slice) -> None:
         """Drop what was kept of some environments, which begin anew."""
-        self._age[envs] = 0
+        self._began[envs] = self._steps
 
     def last(self, env: int) -> Array:
         """Where one environment began and its steps since, oldest first, shape (k, width), k at most ``LENGTH``."""
-        count = min(self.LENGTH, int(self._age[env]) + 1)
+        count = min(self.LENGTH, self._steps - int(self._began[env]) + 1)
         return self._rows[np.arange(self._latest - count + 1, self._latest + 1) % self.LENGTH, env]

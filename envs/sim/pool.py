@@ -59,7 +59,7 @@ class PhysicsPool:
             dtype: of native and staging rows.
             num_threads: physics threads, 0 for one per core.
         """
-        self.threads = Threads(num_threads or usable_cores(), "physics")
+        self.threads = Threads(num_threads or usable_cores(), "physics", _let_overflow)
         """What steps the batches: MuJoCo does so without the interpreter's lock."""
         parts = _parts_of_a_robot(self.threads.count, len(robots))
         self._of_robots = [_share_out(robot, decimation, parts) for robot in robots]
@@ -69,7 +69,7 @@ class PhysicsPool:
         self.rows = [slice(start, stop) for start, stop in pairwise(self._edges.tolist())]
         """Rows of each batch."""
         self.num_envs = int(self._edges[-1])
-        self.device = device
+        self.device, self._on_cpu = device, device.type == "cpu"  # an idle call takes long after physics
         self.fault_folder: Path | None = None
         """Where the last states of sick environments are kept; None keeps none."""
         self._layout = Staging(self.batches, dtype)
@@ -82,7 +82,7 @@ class PhysicsPool:
         ]
         self._split: tuple[Tensor | None, list[tuple[int, Ids, Ids]]] = None, []
         self._read()
-        self.native = self._recorder.tensor.to(device)
+        self.native = self._latest()
         """What MuJoCo wrote in the last step, robot by robot, shape (N, columns of the widest); not in double
         precision, unless ``dtype`` is: no less is left of it than of what is staged, and it is half as much."""
         self.wild = torch.zeros(self.num_envs, dtype=torch.bool, device=device)
@@ -124,9 +124,9 @@ class PhysicsPool:
 
     def advance(self, targets: Tensor, wrench: Tensor | None = None) -> None:
         """Nothing but physics, under what :meth:`aim` returned; :meth:`stage` follows."""
-        native = targets.numpy(force=True)
-        forces = None if wrench is None else wrench.to("cpu", torch.float64).numpy()
-        aimed = ~self.wild.cpu().numpy()[:, None] if self.any_wild else None
+        native = self._array(targets)
+        forces = None if wrench is None else self._array(wrench)
+        aimed = ~self._array(self.wild)[:, None] if self.any_wild else None
         after = self._readings[self._recorder.next()]
 
         def advance(part: int) -> None:
@@ -134,12 +134,12 @@ class PhysicsPool:
             if forces is not None:
                 batch.apply_base_wrench(forces[rows])
             batch.step(native[rows, : batch.spec.num_joints], True if aimed is None else aimed[rows])
-            with np.errstate(over="ignore"):  # of who is sick
-                for written, values in after[part]:
-                    written[:] = values
+            for written, values in after[part]:
+                written[:] = values
 
-        self.threads.share_out(advance, range(len(self.batches)))
-        self.native = self._recorder.tensor.to(self.device, non_blocking=True)
+        with np.errstate(over="ignore"):
+            self.threads.share_out(advance, range(len(self.batches)))
+        self.native = self._latest()
 
     def stage(self) -> None:
         """Judge what MuJoCo wrote in a step, and stage the rows of those who are well."""
@@ -250,7 +250,7 @@ class PhysicsPool:
                 batch.set_state(saved[batch.first_env : batch.first_env + batch.num_envs].numpy())
         self._read()
         self._recorder.forget(slice(None))
-        self.native = self._recorder.tensor.to(self.device)
+        self.native = self._latest()
         self.clock = self.native[:, self._layout.time].clone()
         self.staged = state["staging"].to(self.staged, copy=True)
         self.staged_before = state["staging_before"].to(self.staged, copy=True)
@@ -265,6 +265,15 @@ class PhysicsPool:
                 cause = CAUSES[causes[row] - 1]
                 self.batches[part].fault(env, cause, self._recorder.last(row)).save(self.fault_folder)
 
+    def _latest(self) -> Tensor:
+        """What MuJoCo wrote last, where the learner is."""
+        rows = self._recorder.tensor
+        return rows if self._on_cpu else rows.to(self.device, non_blocking=True)
+
+    def _array(self, x: Tensor) -> Array:
+        """The same for MuJoCo."""
+        return (x if self._on_cpu else x.cpu()).numpy()
+
     def _blocks(self, native: Tensor, ids: Tensor | slice = slice(None)) -> list[Tensor]:
         """Staging rows of some environments, from what MuJoCo wrote of them, as blocks of columns."""
         return self._layout.blocks(native, self.damping[ids], self.conventions.robot[ids], self.conventions)
@@ -273,6 +282,11 @@ class PhysicsPool:
         """Take what MuJoCo wrote last for the latest."""
         for batch, rows in zip(self.batches, self.rows, strict=True):
             batch.read(self._recorder.latest[rows])
+
+
+def _let_overflow() -> None:
+    """Ignore that numbers of who is sick are beyond single precision."""
+    np.seterr(over="ignore")
 
 
 def _parts_of_a_robot(num_threads: int, num_robots: int) -> int:
