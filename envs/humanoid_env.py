@@ -135,6 +135,7 @@ class HumanoidEnv(ControlStep, VecEnv):
         """Buffers that outlive a step."""
         n, device = self.num_envs, self.device
         self._live = self.robots.slot_mask > 0
+        self._single = dtype is torch.float32
         self._all = torch.arange(n, device=device)
         self._nobody = self._all[:0]
         self.common_step_counter, self._stagger = 0, 1
@@ -230,7 +231,8 @@ class HumanoidEnv(ControlStep, VecEnv):
         if self._groups is None:
             self._groups = self._derive_groups()
         own = {"history": self.history.flat, "slot_mask": self.robots.slot_mask, "phase": self.phase}
-        tensors = {name: value.float() for name, value in own.items()} | self._groups._asdict()
+        tensors = own if self._single else {name: value.float() for name, value in own.items()}
+        tensors |= self._groups._asdict()
         return TensorDict(tensors | {"robot": self.robots.robot_id}, batch_size=[self.num_envs])
 
     def pin_commands(self, command: Tensor | None) -> None:

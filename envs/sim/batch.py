@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-
 import mujoco
 import numpy as np
 from mujoco.batch import Batch, SimulationError
@@ -77,13 +75,18 @@ class RobotBatch:
             targets: PD targets [rad], shape (n, joints).
             aimed: whether a simulation takes them or keeps those it has, bool, shape (n, 1), or True for all.
         """
-        np.copyto(self.ctrl, targets, where=aimed)
+        if aimed is True:
+            self.ctrl[:] = targets
+        else:
+            np.copyto(self.ctrl, targets, where=aimed)
         self.advance()
 
     def advance(self) -> None:
         """Nothing but physics. A simulation that MuJoCo refuses to step has a status of its own."""
-        with contextlib.suppress(SimulationError):
+        try:  # noqa: SIM105, which takes as long as an eighth of a simulation
             self._batch.step(nstep=self._decimation, stage=_VEL)
+        except SimulationError:
+            pass
 
     def read(self, out: Array, ids: Ids | slice = slice(None)) -> None:
         """Copy what MuJoCo wrote of some simulations into their rows of ``out``, shape (n, ``width`` or more)."""

@@ -68,6 +68,7 @@ class PhysicsPool:
         self._edges = np.cumsum([0, *(batch.num_envs for batch in self.batches)])
         self.rows = [slice(start, stop) for start, stop in pairwise(self._edges.tolist())]
         """Rows of each batch."""
+        self._targets = [(rows, slice(batch.spec.num_joints)) for batch, rows in zip(self.batches, self.rows, strict=True)]
         self.num_envs = int(self._edges[-1])
         self.device, self._on_cpu = device, device.type == "cpu"  # an idle call takes long after physics
         self.fault_folder: Path | None = None
@@ -133,7 +134,7 @@ class PhysicsPool:
             batch, rows = self.batches[part], self.rows[part]
             if forces is not None:
                 batch.apply_base_wrench(forces[rows])
-            batch.step(native[rows, : batch.spec.num_joints], True if aimed is None else aimed[rows])
+            batch.step(native[self._targets[part]], True if aimed is None else aimed[rows])
             for written, values in after[part]:
                 written[:] = values
 
