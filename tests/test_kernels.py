@@ -63,3 +63,46 @@ def test_kernels_are_called_without_python(monkeypatch):
     inputs = [torch.ones(3)]
     kernels.compile_graph(kernels.record(lambda x: [x + 1], inputs), inputs)
     assert asked["cpp_wrapper"] is True, "a kernel that keeps Python to itself makes the others wait"
+
+
+@pytest.fixture(scope="module")
+def layered():
+    """A compiled kernel with a constant, as TorchInductor hands it out, and what it was made for."""
+    scale, inputs = torch.tensor([2.0, 3.0, 4.0]), [torch.ones(5, 3), torch.arange(3.0)]
+    graph = kernels.record(lambda x, y: [x * scale + y, (x - y).sum(dim=1)], inputs)
+    kept = kernels._without_layers
+    try:
+        kernels._without_layers = lambda kernel, inputs: kernel
+        return kernels.compile_graph(graph, inputs), inputs
+    finally:
+        kernels._without_layers = kept
+
+
+def test_a_kernel_is_called_without_what_torch_puts_before_it(layered, monkeypatch):
+    from torch._inductor.output_code import CompiledFxGraph
+
+    kernel, inputs = layered
+    bare = kernels._without_layers(kernel, inputs)
+
+    def refuse(*_: object) -> None:
+        raise AssertionError("torch's layers are still there")
+
+    monkeypatch.setattr(CompiledFxGraph, "__call__", refuse)
+    for x in (inputs[0], 7 * inputs[0]):
+        total, difference = bare(x, inputs[1])
+        assert torch.equal(total, x * torch.tensor([2.0, 3.0, 4.0]) + inputs[1]), "constants or inputs are mixed up"
+        assert torch.equal(difference, (x - inputs[1]).sum(dim=1))
+    with pytest.raises(AssertionError, match="still there"):
+        kernel(*inputs)
+
+
+def test_layers_that_do_something_are_kept(layered):
+    kernel, inputs = layered
+    for changed in (
+        lambda *x: [y.clone() for y in kernel(*x)],
+        lambda *x: kernel(*x)[:1],
+        lambda *x: kernel(x[0].clone(), x[1]),
+        lambda *x: [*kernel(*x), *kernel(*x)],
+        lambda *x: [y + 1.0 for y in x],
+    ):
+        assert kernels._without_layers(changed, inputs) is changed, "what it does besides calling the kernel is lost"

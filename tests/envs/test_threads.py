@@ -48,6 +48,16 @@ def test_the_number_of_threads_changes_no_bit() -> None:
         assert states[0] == states[i], f"saved states, {threads} threads"
 
 
+@pytest.mark.parametrize("threads", [1, 2])
+def test_numbers_beyond_single_precision_warn_in_no_thread(threads: int) -> None:
+    env = make(threads)
+    for _ in range(5):
+        for batch in env.pool.batches:
+            batch.qvel[0, 8] = 1e12
+        env.step(torch.zeros(NUM_ENVS, env.num_actions))
+    assert (env.pool.causes > 0).sum() == len(env.pool.batches)
+
+
 def test_a_run_goes_on_with_any_number_of_threads() -> None:
     straight, stopped = make(1), make(3)
     expected = run(straight, range(70))
