@@ -10,6 +10,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
+from unittest.mock import patch
 
 import torch
 from torch import Tensor, fx
@@ -119,12 +120,8 @@ def _without_layers(kernel: Kernel, inputs: Sequence[Tensor]) -> Kernel:
         calls.append((compiled, passed, results))
         return results
 
-    CompiledFxGraph.__call__ = listen  # type: ignore[method-assign]
-    try:
-        with torch.no_grad():
-            results = kernel(*inputs)
-    finally:
-        CompiledFxGraph.__call__ = call  # type: ignore[method-assign]
+    with patch.object(CompiledFxGraph, "__call__", listen), torch.no_grad():
+        results = kernel(*inputs)
     if len(calls) != 1:
         return kernel
     ((compiled, passed, made),) = calls

@@ -15,6 +15,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from eagle_rl.machine import usable_cores
@@ -68,7 +69,8 @@ class PhysicsPool:
         self._edges = np.cumsum([0, *(batch.num_envs for batch in self.batches)])
         self.rows = [slice(start, stop) for start, stop in pairwise(self._edges.tolist())]
         """Rows of each batch."""
-        self._targets = [(rows, slice(batch.spec.num_joints)) for batch, rows in zip(self.batches, self.rows, strict=True)]
+        joints = [slice(batch.spec.num_joints) for batch in self.batches]
+        self._targets = list(zip(self.rows, joints, strict=True))
         self.num_envs = int(self._edges[-1])
         self.device, self._on_cpu = device, device.type == "cpu"  # an idle call takes long after physics
         self.fault_folder: Path | None = None
@@ -271,7 +273,7 @@ class PhysicsPool:
         rows = self._recorder.tensor
         return rows if self._on_cpu else rows.to(self.device, non_blocking=True)
 
-    def _array(self, x: Tensor) -> Array:
+    def _array(self, x: Tensor) -> NDArray[Any]:
         """The same for MuJoCo."""
         return (x if self._on_cpu else x.cpu()).numpy()
 
