@@ -194,7 +194,7 @@ class EaglePPO(PPO):
         if self.cfg.use_ppo_loss and kl > MAX_KL_RATIO * self.cfg.desired_kl:
             self._withheld_steps += 1
             return
-        if all(map(math.isfinite, self.gradient.clip(self.cfg.max_grad_norm).tolist())):
+        if all(map(math.isfinite, self.gradient.clip(self.cfg.max_grad_norm))):
             self._skipped_in_a_row = 0
             self.optimizer.step()
             self.actor.distribution.project_std()

@@ -65,11 +65,12 @@ class Gradient:
         actors = {id(parameter) for parameter in self._loss.actor.parameters()}
         self._parts = self._vector.tensor_split([sum(p.numel() for p in learned if id(p) in actors)])
 
-    def clip(self, max_norm: float) -> Tensor:
-        """Shorten the actor's and the critic's gradient to this length; return the lengths they had, shape (2,)."""
-        norms = torch.stack([part.norm() for part in self._parts])
-        for part, shorter in zip(self._parts, (max_norm / (norms + 1e-6)).clamp(max=1.0), strict=True):
-            part.mul_(shorter)
+    def clip(self, max_norm: float) -> list[float]:
+        """Shorten the actor's and the critic's gradient to this length; return the lengths they had."""
+        norms: list[float] = torch.stack([part.norm() for part in self._parts]).tolist()
+        for part, norm in zip(self._parts, norms, strict=True):
+            if norm > max_norm:
+                part.mul_(max_norm / norm)
         return norms
 
 
