@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import defaultdict
 from collections.abc import Mapping
 from typing import Any, Literal
 
@@ -162,26 +161,25 @@ class EaglePPO(PPO):
 
     def _learn(self) -> tuple[dict[str, float], list[float]]:
         """Take a step for each minibatch of each epoch; return mean losses by tag and the KL of each minibatch."""
-        cfg, kls = self.cfg, []
-        sums: defaultdict[str, Tensor] = defaultdict(lambda: torch.zeros(2, device=self.device))
+        cfg, gradient, kls = self.cfg, self.gradient, []
+        sums = torch.zeros((), device=self.device)
         rows = self.storage.num_envs * self.storage.num_transitions_per_env // cfg.num_mini_batches
         batches = self.storage.minibatches(
             cfg.num_mini_batches,
             cfg.num_learning_epochs,
-            self.gradient.num_shares(rows),
+            gradient.num_shares(rows),
             num_updates=torch.tensor(float(self.num_updates), device=self.device),
         )
         for shares in batches:
-            told = self.gradient(shares)
+            losses = gradient(shares)
             self.stopwatch.lap("gradient")
-            total, weight = told[KL]
+            total, weight = losses[gradient.tags.index(KL)]
             kls.append(self._mean_over_processes(total / weight))
             self._step(kls[-1])
-            for tag, entry in told.items():
-                sums[tag] += entry
+            sums = sums + losses
             self.stopwatch.lap("optimiser")
-        entries = {tag: entry.tolist() for tag, entry in sums.items()}
-        return {tag: total / weight for tag, (total, weight) in entries.items() if weight > 0}, kls
+        entries = zip(gradient.tags, sums.tolist(), strict=True)
+        return {tag: total / weight for tag, (total, weight) in entries if weight > 0}, kls
 
     def _step(self, kl: float) -> None:
         """Step along the gradient averaged over processes, unless that does harm.

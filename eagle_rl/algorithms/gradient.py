@@ -36,11 +36,16 @@ class Gradient:
         self.num_shares = self._shared.num_shares
         self.compile = self._shared.compile
 
-    def __call__(self, shares: Sequence[Share]) -> dict[str, Tensor]:
+    @property
+    def tags(self) -> list[str]:
+        """Of the losses that the last call returned."""
+        return self._loss.tags
+
+    def __call__(self, shares: Sequence[Share]) -> Tensor:
         """Put the gradient of the loss on a minibatch into the parameters it depends on.
 
         Returns:
-            Unweighted losses by tag: sum and weight, shape (2,).
+            Unweighted losses, a row for each of ``tags``: sum and weight, shape (T, 2).
         """
         vectors, sums = zip(*self._shared(shares), strict=True)
         first, *others = vectors
@@ -52,7 +57,7 @@ class Gradient:
             self._vector.copy_(first)
         for vector in others[1:]:
             self._vector += vector
-        return dict(zip(self._loss.tags, torch.stack(sums).sum(dim=0), strict=True))
+        return torch.stack(sums).sum(dim=0)
 
     def _lay_out(self, vector: Tensor) -> None:
         """Give every parameter on which the loss depends its part of such a vector for a gradient."""

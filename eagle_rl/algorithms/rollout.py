@@ -11,6 +11,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from eagle_rl.algorithms.sharing import Share
+from eagle_rl.threads import share_out
 
 Cut = tuple[int, Tensor, TensorDict]
 """A step, the environments whose returns end with it, shape (n,), and their final observations."""
@@ -55,7 +56,7 @@ class Rollout(RolloutStorage):
 
     def _shares(self, ids: Tensor, count: int, common: dict[str, Tensor]) -> list[Share]:
         """The transitions of these rows, shape (N,), shared out."""
-        parts = [self._gather(ids[index::count]) for index in range(count)]
+        parts = share_out(lambda index: self._gather(ids[index::count]), range(count))
         common = common | {"live": torch.stack([part["slot_mask"].sum() for part in parts]).sum() / len(ids)}
         return [Share(part | common, index, count, len(ids)) for index, part in enumerate(parts)]
 
