@@ -100,7 +100,7 @@ class EaglePPO(PPO):
         if algo.estimation_coef > 0:
             terms.append(Estimation(algo.estimation_coef))
         if algo.mirror_coef > 0 and not symmetric:
-            terms.append(Mirror(alg.actor, algo.mirror_coef, algo.mirror_fraction, env.mirror, device))
+            terms.append(Mirror(algo.mirror_coef, algo.mirror_fraction, env.mirror, device))
         return alg
 
     def imitate(self, specialists: SpecialistBank, method: Literal["eagle", "kickstart"]) -> None:

@@ -9,7 +9,7 @@ from rsl_rl.models import MLPModel
 from torch import Tensor
 
 from eagle_rl.algorithms.sharing import Computation, Outcome, Share, Shared
-from eagle_rl.algorithms.terms import Log, Policy, Term
+from eagle_rl.algorithms.terms import Log, Mirror, Policy, Term
 from eagle_rl.models import EagleActor
 from eagle_rl.models.distribution import kl_divergence
 
@@ -96,7 +96,8 @@ class _Loss(Computation):
         """Of the loss, a scalar, and of what is logged, shape (T, 2)."""
         log, device = Log(), share["actions"].device.type
         with torch.autocast(device, torch.bfloat16, self._mixed_precision, cache_enabled=False):
-            policy = Policy.of(self.actor, share)
+            images = [image for term in self.terms if isinstance(term, Mirror) for image in term.images(share)]
+            policy = Policy.of(self.actor, share, images)
             loss = torch.stack([term(policy, share, log) for term in self.terms]).sum()
         std = policy.std * share["slot_mask"]
         log.add(KL, kl_divergence(share["old_mean"], share["old_std"], policy.mean.detach(), std.detach()))

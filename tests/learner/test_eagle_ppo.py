@@ -10,6 +10,7 @@ from torch.distributions import Normal, kl_divergence
 
 from eagle_rl.algorithms import specialists as specialists_module
 from eagle_rl.algorithms.specialists import SpecialistBank
+from eagle_rl.algorithms.terms import Mirror
 from eagle_rl.errors import HealthError
 from eagle_rl.models import EagleActor
 from eagle_rl.runners.on_policy import EagleRunner
@@ -207,14 +208,20 @@ def test_the_learning_rate_is_kept_while_the_kl_is_within_a_factor_of_two_of_its
     assert alg.learning_rate == pytest.approx(alg.cfg.learning_rate * factor)
 
 
-def test_the_mirror_loss_is_computed_on_its_share_of_a_minibatch(monkeypatch):
+def test_the_mirror_loss_is_computed_on_its_share_of_a_minibatch_in_the_same_pass(monkeypatch):
     runner = make_runner(**ONE_STEP, mirror_fraction=0.25)
-    rows = []
-    mean_actions = runner.alg.actor.mean_actions
-    monkeypatch.setattr(runner.alg.actor, "mean_actions", lambda *x: rows.append(len(x[0])) or mean_actions(*x))
     collect(runner)
-    runner.alg.update()
-    assert rows == [8 * 24 // 4]
+    rows, alg = [], runner.alg
+    outputs = alg.actor.outputs
+    monkeypatch.setattr(alg.actor, "outputs", lambda *x: rows.append(len(x[0])) or outputs(*x))
+    (share,) = next(iter(alg.storage.minibatches(1, 1)))
+    perm = runner.env.mirror["history"][0]
+    (mirror,) = (term for term in alg.gradient.terms if isinstance(term, Mirror))
+    history = mirror.images(share)[0]
+    alg.update()
+    assert rows == [8 * 24 + 8 * 24 // 4]
+    sign = runner.env.mirror["history"][1]
+    assert torch.equal(history, share["history"][: 8 * 24 // 4, perm] * sign), "images of the leading rows"
 
 
 def test_the_learned_std_stays_inside_its_range():
