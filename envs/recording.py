@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
-from operator import attrgetter
+from operator import attrgetter, itemgetter
 from typing import Any, ClassVar, NamedTuple
 
 import torch
@@ -106,11 +106,11 @@ class Recording:
         Raises:
             CompileError: there is no C++ compiler, or it failed.
         """
-        present = tuple(value is not None for value in self._look(self._owner))
-        replay = self._replays.get(present)
+        present = [value is not None for value in self._look(self._owner)]
+        replay = self._replays.get(tuple(present))
         if replay is None:
             reads = [path for path, there in zip(self._reads, present, strict=True) if there]
-            replay = self._replays[present] = _Replay(
+            replay = self._replays[tuple(present)] = _Replay(
                 self._owner, self._method, args, reads, self._writes, self._scratch
             )
         return replay
@@ -191,15 +191,17 @@ class _Replay:
         self._collect = _getter([paths[i - len(args)] for i in kept[len(args) :]])
         self._used = [kept.index(i) for i in used]
         self._dtypes = [inputs[i].dtype for i in used]
-        self._passed = [None if source is None else kept.index(source) for source in passed]
+        made, count = iter(range(len(passed))), passed.count(None)
+        order = [next(made) if i is None else count + kept.index(i) for i in passed]
+        self._pick = itemgetter(*order, 0)  # with one more than is used, since of one alone it makes no tuple
+        """From what the kernel made, followed by what it was given."""
 
     def __call__(self, *args: Tensor) -> Any:
         given = (*args, *self._collect(self._owner))
         inputs = [given[i] for i in self._used]
         if not all(map(Tensor.is_contiguous, inputs)) or [x.dtype for x in inputs] != self._dtypes:
             inputs = [x.to(dtype).contiguous() for x, dtype in zip(inputs, self._dtypes, strict=True)]
-        made = iter(self._kernel(*inputs))
-        results = (next(made) if source is None else given[source] for source in self._passed)
+        results = iter(self._pick((*self._kernel(*inputs), *given)))
         for attribute in self._writes:
             attribute.put(self._owner, results)
         kind, present = self._returned
