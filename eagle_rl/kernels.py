@@ -109,8 +109,10 @@ def _without_layers(kernel: Kernel, inputs: Sequence[Tensor]) -> Kernel:
     They are for gradients and for inputs that are written to, which there are not; to pass them takes a fiftieth of a
     control step of 64 environments.
     """
-    from torch._inductor.output_code import CompiledFxGraph
-
+    try:
+        from torch._inductor.output_code import CompiledFxGraph
+    except ImportError:  # it is torch's own affair, and other versions may have it elsewhere
+        return kernel
     calls: list[tuple[CompiledFxGraph, list[Tensor], Sequence[Tensor]]] = []
     call = CompiledFxGraph.__call__
 
@@ -126,7 +128,7 @@ def _without_layers(kernel: Kernel, inputs: Sequence[Tensor]) -> Kernel:
         return kernel
     ((compiled, passed, made),) = calls
     constants = passed[: len(passed) - len(inputs)]
-    innermost = compiled.current_callable
+    innermost = getattr(compiled, "current_callable", None)
     if innermost is None or not _same([*constants, *inputs], passed) or not _same(results, made):
         return kernel
     return lambda *tensors: innermost([*constants, *tensors])

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import sys
+
 import pytest
 import torch
 from torch.nn.functional import elu, linear
@@ -106,3 +108,9 @@ def test_layers_that_do_something_are_kept(layered):
         lambda *x: [y + 1.0 for y in x],
     ):
         assert kernels._without_layers(changed, inputs) is changed, "what it does besides calling the kernel is lost"
+
+
+def test_where_torch_has_no_such_layers_a_kernel_is_as_it_was(layered, monkeypatch):
+    kernel, inputs = layered
+    monkeypatch.setitem(sys.modules, "torch._inductor.output_code", None)
+    assert kernels._without_layers(kernel, inputs) is kernel

@@ -31,7 +31,6 @@ class Policy:
     """e(s_t), shape (n, E)."""
     estimate: Tensor
     """Shape (n, 3 or 33)."""
-
     mirrored: Tensor
     """Mean actions of the mirror images it was asked about, without a mask, shape (m, 32)."""
 

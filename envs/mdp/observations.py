@@ -87,15 +87,10 @@ class History:
     """The last K frames s_t, newest first."""
 
     def __init__(self, num_envs: int, length: int, frame: Tensor) -> None:
-        """Start with zeros, as wide as ``frame`` of shape (..., F); call :meth:`reset` before use."""
+        """Start with zeros, K frames as wide as ``frame``, shape (..., F); call :meth:`reset` before use."""
         self._length = length
         self.flat = frame.new_zeros(num_envs, length * frame.shape[-1])
         """The observation group "history", shape (N, K * F)."""
-
-    @property
-    def frames(self) -> Tensor:
-        """Shape (N, K, F)."""
-        return self.flat.view(len(self.flat), self._length, -1)
 
     def push(self, *columns: Tensor) -> None:
         """Put a frame in front and drop the oldest; tensors handed out before keep their values.
