@@ -326,7 +326,7 @@ MUTANTS: tuple[Mutant, ...] = (
     Mutant(PPO, "(last / first) ** min", "(first / last) ** min", LEARNER_TESTS),
     Mutant(LOSSES, "return -torch.min(ratio", "return -torch.max(ratio", "learner/test_losses.py"),
     Mutant(GRADIENT, "torch.add(first, others[0],", "torch.add(first, first,", "learner/test_sharing.py"),
-    Mutant(GRADIENT, "part.mul_(max_norm / norm)", "part.mul_(max_norm / sum(norms))", LEARNER_TESTS),
+    Mutant(GRADIENT, "if norm > max_norm:", "if sum(norms) > max_norm:", LEARNER_TESTS),
     Mutant(TERMS, "self.coef * rows.sum() / everyone", "self.coef * rows.sum() / own", "learner/test_sharing.py"),
     Mutant(SHARING, "range(self.index, rows, self.count)", "range(0, rows, self.count)", "learner/test_rollout.py"),
     Mutant(SHARING, "*(p.detach() for p in parameters)", "*inputs[: len(wanted)]", "learner/test_sharing.py"),
