@@ -54,8 +54,8 @@ _Inbox = SimpleQueue[_Errand | None]
 class Threads:
     """Threads of this process, the caller's among them.
 
-    What passes between them are queues in C: with a pool of futures the interpreter needs three times as long to hand
-    over and to take back, and after physics, which empties the caches, a tenth of a millisecond more.
+    What passes between them are queues in C: with a pool of futures it takes the interpreter more than twice as long to
+    hand over and to take back (``docs/performance.md``).
     """
 
     def __init__(self, count: int, name: str, prepare: Callable[[], object] = lambda: None) -> None:

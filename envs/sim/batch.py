@@ -83,7 +83,7 @@ class RobotBatch:
 
     def advance(self) -> None:
         """Nothing but physics. A simulation that MuJoCo refuses to step has a status of its own."""
-        try:  # noqa: SIM105, which takes as long as an eighth of a simulation
+        try:  # noqa: SIM105, which would be two more calls at each step
             self._batch.step(nstep=self._decimation, stage=_VEL)
         except SimulationError:
             pass

@@ -69,8 +69,7 @@ class PhysicsPool:
         self._edges = np.cumsum([0, *(batch.num_envs for batch in self.batches)])
         self.rows = [slice(start, stop) for start, stop in pairwise(self._edges.tolist())]
         """Rows of each batch."""
-        joints = [slice(batch.spec.num_joints) for batch in self.batches]
-        self._targets = list(zip(self.rows, joints, strict=True))
+        self._targets = [(rows, slice(b.spec.num_joints)) for rows, b in zip(self.rows, self.batches, strict=True)]
         self.num_envs = int(self._edges[-1])
         self.device, self._on_cpu = device, device.type == "cpu"  # an idle call takes long after physics
         self.fault_folder: Path | None = None
@@ -274,7 +273,7 @@ class PhysicsPool:
         return rows if self._on_cpu else rows.to(self.device, non_blocking=True)
 
     def _array(self, x: Tensor) -> NDArray[Any]:
-        """The same for MuJoCo."""
+        """A tensor, wherever it is, as an array; of the same memory if it is the CPU's."""
         return (x if self._on_cpu else x.cpu()).numpy()
 
     def _blocks(self, native: Tensor, ids: Tensor | slice = slice(None)) -> list[Tensor]:
