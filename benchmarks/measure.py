@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from statistics import median
+from statistics import fmean, median
 
 
 @dataclass(frozen=True)
@@ -24,11 +24,13 @@ class Figure:
 
 @dataclass(frozen=True)
 class Cost:
-    """Medians of one thing that was measured in turns with others [s]."""
+    """Medians of one thing that was measured in turns with others, and its mean [s]."""
 
     wall: float
     cpu: float
     """Of all threads of the process; what the kernel has booked, so it wants many rounds where threads are short."""
+    mean: float
+    """Wall time with what is rare and takes longer, which medians do not show: resets, and whatever else has a core."""
 
 
 def in_turns(
@@ -37,7 +39,7 @@ def in_turns(
     warm_up: int = 3,
     before: Mapping[str, Callable[[], object]] | None = None,
 ) -> dict[str, Cost]:
-    """Do every action in turn until the time is up; their median costs.
+    """Do every action in turn until the time is up; their costs.
 
     Args:
         actions: what to measure, by name.
@@ -57,7 +59,12 @@ def in_turns(
             walls[name].append(time.perf_counter() - wall)
             cpus[name].append(time.process_time() - cpu)
         rounds += 1
-    return {name: Cost(median(walls[name][warm_up:]), median(cpus[name][warm_up:])) for name in actions}
+    return {name: _cost(walls[name][warm_up:], cpus[name][warm_up:]) for name in actions}
+
+
+def _cost(walls: Sequence[float], cpus: Sequence[float]) -> Cost:
+    """What the rounds say that are counted."""
+    return Cost(median(walls), median(cpus), fmean(walls))
 
 
 def milliseconds(**seconds: float) -> str:

@@ -23,7 +23,7 @@ from .workloads import BarePhysics, Stepping, experiment, make_env, make_runner,
 
 
 def environment(num_envs: int, threads: int, seconds: float, bar: str) -> list[Figure]:
-    """Rate of the whole environment step as a share of the bare physics' rate, as measured and as the CPU time says."""
+    """Rate of the whole environment step as a share of the bare physics' rate: medians, means and by CPU time."""
     cost = step_costs({"pool": make_env(experiment(threads), num_envs)}, seconds)["pool"]
     step, bare = cost.step, cost.bare
     name = f"environment step / bare physics, {num_envs} envs"
@@ -34,6 +34,7 @@ def environment(num_envs: int, threads: int, seconds: float, bar: str) -> list[F
     )
     return [
         Figure(name, bare.wall / step.wall, "x", bar, detail),
+        Figure(f"{name}, means", bare.mean / step.mean, "x", bar, milliseconds(step=step.mean, bare=bare.mean)),
         Figure(f"{name}, from CPU time", ideal / (ideal + cost.overhead), "x", bar, cpu_detail),
     ]
 

@@ -168,6 +168,7 @@ class EaglePPO(PPO):
             cfg.num_mini_batches,
             cfg.num_learning_epochs,
             gradient.num_shares(rows),
+            gradient.prepare,
             num_updates=torch.tensor(float(self.num_updates), device=self.device),
         )
         for shares in batches:

@@ -41,8 +41,15 @@ class Gradient:
         """Of the losses that the last call returned."""
         return self._loss.tags
 
+    def prepare(self, share: Share) -> Share:
+        """A share as the terms want it, which is the same in every epoch."""
+        for term in self.terms:
+            if isinstance(term, Mirror):
+                share = term.reflect(share)
+        return share
+
     def __call__(self, shares: Sequence[Share]) -> Tensor:
-        """Put the gradient of the loss on a minibatch into the parameters it depends on.
+        """Put the gradient of the loss on a minibatch, whose shares are prepared, into the parameters it depends on.
 
         Returns:
             Unweighted losses, a row for each of ``tags``: sum and weight, shape (T, 2).
@@ -96,8 +103,7 @@ class _Loss(Computation):
         """Of the loss, a scalar, and of what is logged, shape (T, 2)."""
         log, device = Log(), share["actions"].device.type
         with torch.autocast(device, torch.bfloat16, self._mixed_precision, cache_enabled=False):
-            images = [image for term in self.terms if isinstance(term, Mirror) for image in term.images(share)]
-            policy = Policy.of(self.actor, share, images)
+            policy = Policy.of(self.actor, share)
             loss = torch.stack([term(policy, share, log) for term in self.terms]).sum()
         std = policy.std * share["slot_mask"]
         log.add(KL, kl_divergence(share["old_mean"], share["old_std"], policy.mean.detach(), std.detach()))

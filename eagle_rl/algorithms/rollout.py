@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -32,7 +33,12 @@ class Rollout(RolloutStorage):
         self.cuts = []
 
     def minibatches(
-        self, num_mini_batches: int, num_epochs: int, num_shares: int = 1, **common: Tensor
+        self,
+        num_mini_batches: int,
+        num_epochs: int,
+        num_shares: int = 1,
+        prepare: Callable[[Share], Share] = lambda share: share,
+        **common: Tensor,
     ) -> Iterator[list[Share]]:
         """Minibatches of all transitions in one random order, the same in every epoch: a second copy of the rollout.
 
@@ -40,6 +46,7 @@ class Rollout(RolloutStorage):
             num_mini_batches: of an epoch.
             num_epochs: how often each minibatch comes.
             num_shares: parts of each minibatch.
+            prepare: what is made of each share, once for all epochs and without what is common to all.
             common: scalars that every share gets by name.
 
         Yields:
@@ -50,15 +57,21 @@ class Rollout(RolloutStorage):
         """
         size = self.num_envs * self.num_transitions_per_env // num_mini_batches
         order = torch.randperm(num_mini_batches * size, device=self.device)
-        batches = [self._shares(ids, num_shares, common) for ids in order.split(size)]
+        batches = [self._shares(ids, num_shares, prepare, common) for ids in order.split(size)]
         for _ in range(num_epochs):
             yield from batches
 
-    def _shares(self, ids: Tensor, count: int, common: dict[str, Tensor]) -> list[Share]:
+    def _shares(
+        self, ids: Tensor, count: int, prepare: Callable[[Share], Share], common: dict[str, Tensor]
+    ) -> list[Share]:
         """The transitions of these rows, shape (N,), shared out."""
-        parts = share_out(lambda index: self._gather(ids[index::count]), range(count))
+
+        def part(index: int) -> Share:
+            return prepare(Share(self._gather(ids[index::count]), index, count, len(ids)))
+
+        parts = share_out(part, range(count))
         common = common | {"live": torch.stack([part["slot_mask"].sum() for part in parts]).sum() / len(ids)}
-        return [Share(part | common, index, count, len(ids)) for index, part in enumerate(parts)]
+        return [replace(part, tensors={**part.tensors, **common}) for part in parts]
 
     def _gather(self, ids: Tensor) -> dict[str, Tensor]:
         """The transitions of these rows, shape (n,)."""

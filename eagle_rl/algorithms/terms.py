@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import torch
@@ -32,22 +32,16 @@ class Policy:
     estimate: Tensor
     """Shape (n, 3 or 33)."""
     mirrored: Tensor
-    """Mean actions of the mirror images it was asked about, without a mask, shape (m, 32)."""
+    """Mean actions of the mirror images behind the rows, without a mask, shape (m, 32)."""
 
     @classmethod
-    def of(cls, actor: EagleActor, share: Share, images: Sequence[Tensor] = ()) -> Policy:
+    def of(cls, actor: EagleActor, share: Share) -> Policy:
         """One forward pass, which leaves no trace in the actor: other threads make theirs.
 
-        Args:
-            actor: the policy's networks.
-            share: the rows.
-            images: further inputs of the actor, (m, ...) each, of which mean actions are wanted; with the share's rows
-                in one pass they take less time than in a pass of their own.
+        What the actor reads of the share may go on with mirror images (:meth:`Mirror.reflect`): in one pass with the
+        rows they take less time than in a pass of their own.
         """
-        inputs, rows = [share[group] for group in ACTOR_INPUTS], len(share["slot_mask"])
-        if images:
-            inputs = [torch.cat(pair) for pair in zip(inputs, images, strict=True)]
-        history, command, clock = inputs
+        rows, (history, command, clock) = len(share["slot_mask"]), (share[group] for group in ACTOR_INPUTS)
         mean, embedding, estimate = actor.outputs(history, command, clock)
         std = actor.distribution.std_param.clamp(*actor.distribution.std_range)
         return cls(mean[:rows] * share["slot_mask"], std, embedding[:rows], estimate[:rows], mean[rows:])
@@ -120,10 +114,11 @@ class Mirror:
         self.sides = Sides({group: mirror[group] for group in ACTOR_INPUTS}).to(device)
         self.actions = tuple(x.to(device) for x in mirror["actions"])
 
-    def images(self, share: Share) -> list[Tensor]:
-        """The actor's inputs where the leading rows are seen in a mirror."""
+    def reflect(self, share: Share) -> Share:
+        """The share, with what a mirror shows of its leading rows behind all that the actor reads of it."""
         own, _ = share.leading(self.fraction)
-        return [self.sides.mirrored(group, share[group][:own]) for group in ACTOR_INPUTS]
+        seen = {g: torch.cat((share[g], self.sides.mirrored(g, share[g][:own]))) for g in ACTOR_INPUTS}
+        return replace(share, tensors={**share.tensors, **seen})
 
     def __call__(self, policy: Policy, share: Share, log: Log) -> Tensor:
         """Weighted loss."""

@@ -10,9 +10,9 @@ from torch.distributions import Normal, kl_divergence
 
 from eagle_rl.algorithms import specialists as specialists_module
 from eagle_rl.algorithms.specialists import SpecialistBank
-from eagle_rl.algorithms.terms import Mirror
 from eagle_rl.errors import HealthError
 from eagle_rl.models import EagleActor
+from eagle_rl.models.actor import ACTOR_INPUTS
 from eagle_rl.runners.on_policy import EagleRunner
 from tests.learner.helpers import collect, make_runner, parameters
 
@@ -215,13 +215,13 @@ def test_the_mirror_loss_is_computed_on_its_share_of_a_minibatch_in_the_same_pas
     outputs = alg.actor.outputs
     monkeypatch.setattr(alg.actor, "outputs", lambda *x: rows.append(len(x[0])) or outputs(*x))
     (share,) = next(iter(alg.storage.minibatches(1, 1)))
-    perm = runner.env.mirror["history"][0]
-    (mirror,) = (term for term in alg.gradient.terms if isinstance(term, Mirror))
-    history = mirror.images(share)[0]
+    prepared = alg.gradient.prepare(share)
     alg.update()
     assert rows == [8 * 24 + 8 * 24 // 4]
-    sign = runner.env.mirror["history"][1]
-    assert torch.equal(history, share["history"][: 8 * 24 // 4, perm] * sign), "images of the leading rows"
+    for group in ACTOR_INPUTS:
+        perm, sign = runner.env.mirror[group]
+        images = share[group][: 8 * 24 // 4, perm] * sign
+        assert torch.equal(prepared[group], torch.cat((share[group], images))), f"images of the leading rows: {group}"
 
 
 def test_the_learned_std_stays_inside_its_range():
