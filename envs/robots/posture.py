@@ -21,8 +21,11 @@ PITCH_JOINTS = ("hip_pitch", "knee_pitch", "ankle_pitch")
 POSTURE_SLOTS = tuple(tuple(SLOT_INDEX[f"{side}_{joint}"] for joint in PITCH_JOINTS) for side in FEET)
 """Slots of those joints, (2, 3)."""
 
-_WEIGHTS = np.array([1.0, 0.5, 1.0])
-"""Of tilt [1/rad], height and balance [1/m]: where limits forbid having all, a robot squats less but on its soles."""
+_WEIGHTS = np.array([1.0, 0.5, 2.0])
+"""Of tilt [1/rad], height and balance [1/m]: where limits forbid having all, a robot squats less but on its soles.
+
+With half as much balance N1, 4 cm behind where it balances, tips over its heels (docs/experiments.md, 39).
+"""
 _ITERATIONS = 40
 _STEP = 1e-6
 """Of the finite differences [rad]."""
