@@ -21,11 +21,11 @@ PITCH_JOINTS = ("hip_pitch", "knee_pitch", "ankle_pitch")
 POSTURE_SLOTS = tuple(tuple(SLOT_INDEX[f"{side}_{joint}"] for joint in PITCH_JOINTS) for side in FEET)
 """Slots of those joints, (2, 3)."""
 
-_WEIGHTS = np.array([1.0, 0.5, 2.0])
-"""Of tilt [1/rad], height and balance [1/m]: where limits forbid having all, a robot squats less but on its soles.
-
-With half as much balance N1, 4 cm behind where it balances, tips over its heels (docs/experiments.md, 39).
-"""
+_WEIGHTS = np.array([1.0, 0.5, 1.0])
+"""Of tilt [1/rad], height and balance [1/m]: where limits forbid having all, a robot squats less but on its soles."""
+_BALANCE_MARGIN, _BALANCE_STEEPNESS = 0.02, 5.0
+"""Beyond so much off balance [m] the rest counts so many times more: without, N1 would rest over its heels and tips over
+them after ten seconds (docs/experiments.md, 39)."""
 _ITERATIONS = 40
 _STEP = 1e-6
 """Of the finite differences [rad]."""
@@ -72,6 +72,13 @@ def leg_length(spec: RobotSpec) -> float:
     return thigh + shank + float(ankle[2] - foot.act(spec.sole_offsets[0])[2])
 
 
+def _weighed(missing: Array) -> Array:
+    """What a pose lacks of tilt [rad], height and balance [m], as the solver counts it, shape (3,)."""
+    tilt, height, balance = _WEIGHTS * missing
+    beyond = balance - np.clip(balance, -_BALANCE_MARGIN, _BALANCE_MARGIN)
+    return np.array([tilt, height, balance + _BALANCE_STEEPNESS * beyond])
+
+
 class _Legs:
     """Kinematics of a robot whose legs bend together."""
 
@@ -109,18 +116,18 @@ class _Legs:
         """Canonical offsets (3,) for a height offset [m] and a pitch [rad]: Levenberg-Marquardt inside the limits."""
         wanted = self._rest + np.array([0.0, height, 0.0])
         bend, damping = start, 1e-3
-        missing = _WEIGHTS * (wanted - self.measure(pitch, bend))
+        missing = _weighed(wanted - self.measure(pitch, bend))
         for _ in range(_ITERATIONS):
             if np.abs(missing).max() < _TOLERANCE:
                 break
-            moved = np.stack([self.measure(pitch, bend + d) for d in _STEP * np.eye(3)], axis=1)
-            jacobian = (_WEIGHTS[:, None] * (wanted[:, None] - moved) - missing[:, None]) / -_STEP
+            moved = [self.measure(pitch, bend + d) for d in _STEP * np.eye(3)]
+            jacobian = (np.stack([_weighed(wanted - m) for m in moved], axis=1) - missing[:, None]) / -_STEP
             downhill = jacobian.T @ missing
             held = ((bend <= self._lower) & (downhill < 0)) | ((bend >= self._upper) & (downhill > 0))
             jacobian, downhill = np.where(held, 0.0, jacobian), np.where(held, 0.0, downhill)
             step = np.linalg.solve(jacobian.T @ jacobian + damping * np.eye(3), downhill)
             trial = np.clip(bend + step, self._lower, self._upper)
-            left = _WEIGHTS * (wanted - self.measure(pitch, trial))
+            left = _weighed(wanted - self.measure(pitch, trial))
             if left @ left < missing @ missing:
                 bend, missing, damping = trial, left, damping * 0.1
             else:

@@ -65,7 +65,7 @@ def test_within_reach_the_base_is_where_it_is_commanded_over_flat_soles_and_in_b
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
-def test_where_joints_end_height_is_given_up_before_flat_soles(robot):
+def test_where_joints_end_height_is_given_up_before_flat_soles_and_balance(robot):
     spec = load_robot(robot)
     table = posture_table(spec)
     for height in (-0.3, -0.2):
@@ -75,8 +75,8 @@ def test_where_joints_end_height_is_given_up_before_flat_soles(robot):
             missing = base - spec.nominal_height - height
             where = f"{robot} at {height} m, {pitch:.1f} rad: tilt {tilt:.3f}, {missing:.3f} m too high"
             assert abs(tilt) < 0.03, where
-            assert -0.005 < missing < 0.12, where
-            assert abs(ahead - measured(robot, np.zeros(3), 0.0)[2]) < 0.06, where
+            assert -0.005 < missing < 0.16, where
+            assert abs(ahead - measured(robot, np.zeros(3), 0.0)[2]) < 0.025, f"{where}, {ahead:.3f} m ahead"
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
