@@ -23,9 +23,9 @@ POSTURE_SLOTS = tuple(tuple(SLOT_INDEX[f"{side}_{joint}"] for joint in PITCH_JOI
 
 _WEIGHTS = np.array([1.0, 0.5, 1.0])
 """Of tilt [1/rad], height and balance [1/m]: where limits forbid having all, a robot squats less but on its soles."""
-_BALANCE_MARGIN, _BALANCE_STEEPNESS = 0.02, 5.0
-"""Beyond so much off balance [m] the rest counts so many times more: without, N1 would rest over its heels and tips over
-them after ten seconds (docs/experiments.md, 39)."""
+_BALANCE_MARGIN = 0.04
+"""So far off balance [m] counts twice as much as its weight says, and more the farther: without, N1 would rest over its
+heels, and tips over them after ten seconds (docs/experiments.md, 39)."""
 _ITERATIONS = 40
 _STEP = 1e-6
 """Of the finite differences [rad]."""
@@ -74,9 +74,8 @@ def leg_length(spec: RobotSpec) -> float:
 
 def _weighed(missing: Array) -> Array:
     """What a pose lacks of tilt [rad], height and balance [m], as the solver counts it, shape (3,)."""
-    tilt, height, balance = _WEIGHTS * missing
-    beyond = balance - np.clip(balance, -_BALANCE_MARGIN, _BALANCE_MARGIN)
-    return np.array([tilt, height, balance + _BALANCE_STEEPNESS * beyond])
+    steep = np.array([1.0, 1.0, 1.0 + (missing[2] / _BALANCE_MARGIN) ** 2])
+    return _WEIGHTS * missing * steep
 
 
 class _Legs:

@@ -328,7 +328,7 @@ MUTANTS: tuple[Mutant, ...] = (
     Mutant(GRADIENT, "torch.add(first, others[0],", "torch.add(first, first,", "learner/test_sharing.py"),
     Mutant(GRADIENT, "if norm > max_norm:", "if sum(norms) > max_norm:", LEARNER_TESTS),
     Mutant(TERMS, "self.coef * rows.sum() / everyone", "self.coef * rows.sum() / own", "learner/test_sharing.py"),
-    Mutant("envs/robots/posture.py", "= 0.02, 5.0", "= 0.02, 0.0", "robots/test_posture.py"),
+    Mutant("envs/robots/posture.py", "BALANCE_MARGIN = 0.04", "BALANCE_MARGIN = 40.0", "robots/test_posture.py"),
     Mutant(TERMS, "self.sides.mirrored(g, share[g][:own])", "share[g][:own]", LEARNER_TESTS),
     Mutant(SHARING, "range(self.index, rows, self.count)", "range(0, rows, self.count)", "learner/test_rollout.py"),
     Mutant(SHARING, "*(p.detach() for p in parameters)", "*inputs[: len(wanted)]", "learner/test_sharing.py"),
