@@ -25,7 +25,7 @@ _WEIGHTS = np.array([1.0, 0.5, 1.0])
 """Of tilt [1/rad], height and balance [1/m]: where limits forbid having all, a robot squats less but on its soles."""
 _BALANCE_MARGIN = 0.04
 """So far off balance [m] counts twice as much as its weight says, and more the farther: without, N1 would rest over its
-heels, and tips over them after ten seconds (docs/experiments.md, 39)."""
+heels, and tips over them after some ten seconds (docs/experiments.md, 39)."""
 _ITERATIONS = 40
 _STEP = 1e-6
 """Of the finite differences [rad]."""
