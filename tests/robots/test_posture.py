@@ -80,6 +80,23 @@ def test_where_joints_end_height_is_given_up_before_flat_soles_and_balance(robot
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
+def test_nowhere_does_a_robot_rest_4_cm_from_its_balance_and_height_is_given_up_only_where_a_joint_ends(robot):
+    """The whole table: commands of -0.3 m are told 1.25 times as deep."""
+    spec = load_robot(robot)
+    table, rest = posture_table(spec), measured(robot, np.zeros(3), 0.0)
+    legs = [spec.slots.tolist().index(slot) for slot in POSTURE_SLOTS[0]]
+    ends = spec.signs[legs] * (np.stack([spec.joint_lower, spec.joint_upper])[:, legs] - spec.default_joint_pos[legs])
+    for height in HEIGHTS:
+        for pitch in PITCHES:
+            bend = node(table, height, pitch)
+            _, base, ahead = measured(robot, bend, pitch)
+            where = f"{robot} at {height:.2f} m, {pitch:.1f} rad"
+            assert abs(ahead - rest[2]) < 0.04, f"{where}: {ahead - rest[2]:.3f} m ahead"
+            at_an_end = np.abs(ends - bend).min() < 1e-6
+            assert base - rest[1] - height < 1e-3 or at_an_end, f"{where}: {base - rest[1]:.3f} m, no joint ends"
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
 def test_no_pose_is_beyond_a_joint_limit(robot):
     spec = load_robot(robot)
     angles = spec.default_joint_pos + spec.signs * joint_offsets(spec)
