@@ -182,6 +182,12 @@ class ControlStep:
         """What each command asks for, as it is now [m/s, m/s, rad/s, m, rad], shape (N, 5)."""
         return measured_commands(self.state, self.robots)
 
+    def balance(self) -> tuple[Tensor, Tensor]:
+        """Gravity in the base frame, (N, 3), and which joints are at a soft limit or beyond, bool, (N, 32)."""
+        state, robots = self.state, self.robots
+        ended = (state.joint_pos <= robots.joint_soft_lower) | (state.joint_pos >= robots.joint_soft_upper)
+        return state.projected_gravity_b, ended & self._live
+
     # --- parts of a step ----------------------------------------------------------------------------------------------
 
     def _aim(self, actions: Tensor) -> tuple[Tensor, Tensor | None]:

@@ -37,7 +37,7 @@ from .pooling import pool_robots, share
 from .rng import CounterRng
 from .robots.embodiment import pooled_embodiment
 from .robots.model import build_model
-from .robots.slots import NUM_SLOTS
+from .robots.slots import NUM_SLOTS, SLOT_NAMES
 from .robots.spec import RobotSpec
 from .sim.pool import PhysicsPool
 from .sim.terrain import Terrain, build_terrain
@@ -56,6 +56,7 @@ class HumanoidEnv(ControlStep, VecEnv):
     """
 
     num_actions = NUM_SLOTS
+    slot_names = SLOT_NAMES
     final_of_episodes = False
     """Whether ``final_ids`` lists every environment whose episode ended, as Gymnasium wants it, and no other."""
     over_processes: Callable[[Tensor, Pooling], Tensor] = staticmethod(lambda x, how: x)

@@ -77,7 +77,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--device", type=device, default="cpu", metavar="cpu|cuda", help="where the policy computes [cpu]"
     )
-    parser.add_argument("--out", type=Path, metavar="DIR", help="write results and table.{md,csv,tex,json} here")
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="write results, table.{md,csv,tex,json} and any falls.md here"
+    )
     return parser
 
 
@@ -171,9 +173,10 @@ def main(argv: Sequence[str]) -> int:
 
     from rich.console import Console
 
+    from eagle_rl.evaluation.falls import falls_table
     from eagle_rl.evaluation.metrics import SUBSETS
     from eagle_rl.evaluation.render import to_markdown
-    from eagle_rl.evaluation.report import common_protocol, common_ranges, tracking_table
+    from eagle_rl.evaluation.report import common_protocol, common_ranges, falls_of, tracking_table
 
     if args.subset not in SUBSETS:
         raise ConfigError(f"--subset: got {args.subset!r}, expected one of {', '.join(SUBSETS)}.")
@@ -190,9 +193,10 @@ def main(argv: Sequence[str]) -> int:
         if args.out is not None:
             _store(args.out, method, result)
     table = tracking_table(results, args.subset, args.falls)
-    print(to_markdown(table))
+    falls = falls_table(falls_of(results))
+    print(to_markdown(table), *([falls] if falls else []), sep="\n")
     if args.out is not None:
-        _write(args.out, table)
+        _write(args.out, table, falls)
     return 0
 
 
@@ -212,12 +216,17 @@ def _store(folder: Path, method: str, result: EvaluationResult) -> None:
     file.write_text(result.to_json(), encoding="utf-8")
 
 
-def _write(folder: Path, table: Table) -> None:
-    """Write the table in every format."""
+def _write(folder: Path, table: Table, falls: str) -> None:
+    """Write the table in every format, and how robots fell."""
     from eagle_rl.evaluation.render import FORMATS
 
     for suffix, write in FORMATS.items():
         (folder / f"table.{suffix}").write_text(write(table), encoding="utf-8")
+    story = folder / "falls.md"
+    if falls:
+        story.write_text(falls, encoding="utf-8")
+    else:
+        story.unlink(missing_ok=True)
 
 
 def _slug(name: str) -> str:

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from eagle_rl.config.schema import CommandsCfg, EvaluationCfg, Range, TaskCfg
 from eagle_rl.errors import CheckpointError
+from eagle_rl.evaluation.falls import BalancedEnv, Fall, FallWatch
 from eagle_rl.evaluation.metrics import SETTLING_TIME_S, RobotMetrics, TrackingAccumulator
 from eagle_rl.evaluation.protocol import (
     draw_commands,
@@ -36,7 +37,7 @@ Policy = Callable[[TensorDict], Tensor]
 """Deterministic actions (N, 32) for observations (N,)."""
 
 
-class TrackingEnv(Protocol):
+class TrackingEnv(BalancedEnv, Protocol):
     """What an evaluation needs of an environment."""
 
     num_envs: int
@@ -137,13 +138,14 @@ def evaluate(
     for robot in robots:
         commands = draw_commands(task.commands, ev, robot, ev.num_envs_per_robot)
         judged = judged_commands(ev, ev.num_envs_per_robot)
-        parts = []
+        parts, falls = [], []
         for start in range(0, ev.num_envs_per_robot, size):
             chunk = commands[start : start + size]
             env = make_env([robot], len(chunk), task, ev.seed, start)
             accumulator = TrackingAccumulator(judged[start : start + size])
-            parts.append(_run_chunk(policy, env, chunk, accumulator, task, ev, on_step))
-        metrics[robot] = TrackingAccumulator.join(parts).finish()
+            falls += _run_chunk(policy, env, chunk, accumulator, task, ev, on_step)
+            parts.append(accumulator)
+        metrics[robot] = dataclasses.replace(TrackingAccumulator.join(parts).finish(), falls=tuple(sorted(falls, key=_time)))
     return metrics
 
 
@@ -156,8 +158,9 @@ def _run_chunk(
     task: TaskCfg,
     ev: EvaluationCfg,
     on_step: Callable[[int], None],
-) -> TrackingAccumulator:
-    """Roll out one chunk of environments; commands have shape (N, draws, 5)."""
+) -> list[Fall]:
+    """Roll out one chunk of environments, whose errors are accumulated; commands have shape (N, draws, 5)."""
+    watch = FallWatch(env, step_dt(task))
     draw_steps = steps_per_draw(ev)
     settling_steps = round(SETTLING_TIME_S / step_dt(task))
     for t in range(ev.num_steps):
@@ -169,11 +172,18 @@ def _run_chunk(
         if t % draw_steps == 0:
             env.pin_commands(command)
             obs = env.get_observations()
+        watch.look()
         obs, _, dones, extras = env.step(tiled(policy, obs))
-        fell = dones.bool() & ~extras["time_outs"].bool()
-        accumulator.add(env.tracking_errors().cpu(), command, fell.cpu(), settled)
+        fell = (dones.bool() & ~extras["time_outs"].bool()).cpu()
+        watch.note(t, command, fell & accumulator.alive)
+        accumulator.add(env.tracking_errors().cpu(), command, fell, settled)
         on_step(len(command))
-    return accumulator
+    return watch.falls
+
+
+def _time(fall: Fall) -> float:
+    """By which falls are sorted, so that it does not tell how environments were simulated together."""
+    return fall.time_s
 
 
 def tiled(policy: Policy, obs: TensorDict) -> Tensor:

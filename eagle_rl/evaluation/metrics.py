@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from eagle_rl.evaluation.falls import Fall
 from eagle_rl.evaluation.protocol import COMMANDS
 
 SUBSETS = ("all", "settled", "standing", "walking", "squatting", "leaning")
@@ -57,6 +58,8 @@ class RobotMetrics:
     upright: float
     """Share of commanded steps before any fall."""
     subsets: Mapping[str, TrackingErrors]
+    falls: tuple[Fall, ...] = ()
+    """First falls, the earliest first; earlier versions did not keep them."""
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> RobotMetrics:
@@ -65,7 +68,13 @@ class RobotMetrics:
             name: TrackingErrors(share=s["share"], errors=tuple(s["errors"]), charged=tuple(s["charged"]))
             for name, s in data["subsets"].items()
         }
-        return cls(num_envs=data["num_envs"], survival=data["survival"], upright=data["upright"], subsets=subsets)
+        return cls(
+            num_envs=data["num_envs"],
+            survival=data["survival"],
+            upright=data["upright"],
+            subsets=subsets,
+            falls=tuple(map(Fall.from_dict, data.get("falls", ()))),
+        )
 
 
 def _mean(total: Tensor, steps: Tensor) -> tuple[float | None, ...]:

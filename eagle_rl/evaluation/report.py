@@ -10,6 +10,7 @@ from typing import Literal
 from eagle_rl.config.schema import EvaluationCfg, Range
 from eagle_rl.errors import ConfigError
 from eagle_rl.evaluation.evaluate import EvaluationResult
+from eagle_rl.evaluation.falls import Fall
 from eagle_rl.evaluation.metrics import RobotMetrics
 from eagle_rl.evaluation.protocol import COMMANDS, num_draws
 from eagle_rl.evaluation.reference import PAPER, PAPER_H1, Errors, floors, score_units
@@ -163,6 +164,24 @@ def tracking_table(
         caption=describe(ev, subset, falls),
         checkpoints={method: tuple(run.checkpoint for run in runs) for method, runs in results.items()},
     )
+
+
+def falls_of(results: Mapping[str, Sequence[EvaluationResult]]) -> dict[tuple[str, str], tuple[list[Fall], int]]:
+    """By robot and method: falls over all seeds, and how many environments there were.
+
+    Args:
+        results: by method, one result per training seed.
+    """
+    robots = dict.fromkeys(robot for runs in results.values() for run in runs for robot in run.robots)
+    judged = {
+        (robot, method): [run.robots[robot] for run in runs if robot in run.robots]
+        for robot in robots
+        for method, runs in results.items()
+    }
+    return {
+        names: ([fall for each in some for fall in each.falls], sum(each.num_envs for each in some))
+        for names, some in judged.items()
+    }
 
 
 def _row(

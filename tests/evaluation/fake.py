@@ -22,6 +22,9 @@ class ScriptedEnv:
         self.t = 0
         self.command = torch.full((num_envs, 5), torch.nan)
         self.measured = torch.zeros(num_envs, 5)
+        self.slot_names = tuple(f"joint_{i}" for i in range(32))
+        self.gravity = torch.tensor([0.0, 0.0, -1.0]).repeat(num_envs, 1)
+        self.at_stop = torch.zeros(num_envs, 32, dtype=torch.bool)
 
     def pin_commands(self, command: Tensor | None) -> None:
         assert command is not None
@@ -42,6 +45,9 @@ class ScriptedEnv:
 
     def tracking_errors(self) -> Tensor:
         return (self.measured - self.command).abs()
+
+    def balance(self) -> tuple[Tensor, Tensor]:
+        return self.gravity, self.at_stop
 
 
 def make_scripted_env(robots: Sequence[str], num_envs: int, task: TaskCfg, seed: int, first: int = 0) -> ScriptedEnv:

@@ -53,6 +53,11 @@ class JudgedToyEnv(ToyEnv):
     def measured_commands(self) -> Tensor:
         return self.frames[:, 0, :5]
 
+    slot_names = ("joint",)
+
+    def balance(self) -> tuple[Tensor, Tensor]:
+        return torch.zeros(self.num_envs, 3), torch.zeros(self.num_envs, 1, dtype=torch.bool)
+
     def tracking_errors(self) -> Tensor:
         return (self.measured_commands() - self.command).abs()
 
