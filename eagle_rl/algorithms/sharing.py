@@ -7,7 +7,7 @@ every network, two were hardly quicker than one.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -41,9 +41,9 @@ class Share:
         return self.tensors[name]
 
     @property
-    def kind(self) -> tuple[int, int, int]:
-        """What it has in common with its like of other wholes."""
-        return self.index, self.count, self.size
+    def kind(self) -> Hashable:
+        """What it has in common with its like: all that is computed of it depends on its tensors and on this alone."""
+        return self.size, tuple(x.shape for x in self.tensors.values())
 
     def leading(self, fraction: float) -> tuple[int, int]:
         """How many of its first rows lead the whole, and how many do, where it has every ``count``-th of the rows."""
@@ -83,7 +83,7 @@ class Shared:
         """Compute as it says, eagerly unless told otherwise."""
         self._computation = computation
         self._parameters = list(computation.parameters())
-        self._kernels: dict[tuple[int, int, int], Callable[[Share], Outcome]] = {}
+        self._kernels: dict[Hashable, Callable[[Share], Outcome]] = {}
         self._compiled = self._gave_up = False
 
     def num_shares(self, rows: int) -> int:

@@ -187,7 +187,7 @@ def test_kernels_do_what_the_code_does_at_every_value_of_the_parameters(algo, me
         runner.alg.compile_from = compile_from
         runner.learn(2)
         ends.append(parameters(runner))
-    assert len(graphs) == 4, "one for acting, one for values, one for each share"
+    assert len(graphs) == 3, "one for acting, one for values, one for shares, which are of one size"
     require_alike(ends[1], ends[0], 0.02 if "precision" in algo else 1e-4)
 
 
