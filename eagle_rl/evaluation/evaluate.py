@@ -145,7 +145,9 @@ def evaluate(
             accumulator = TrackingAccumulator(judged[start : start + size])
             falls += _run_chunk(policy, env, chunk, accumulator, task, ev, on_step)
             parts.append(accumulator)
-        metrics[robot] = dataclasses.replace(TrackingAccumulator.join(parts).finish(), falls=tuple(sorted(falls, key=_time)))
+        metrics[robot] = dataclasses.replace(
+            TrackingAccumulator.join(parts).finish(), falls=tuple(sorted(falls, key=_time))
+        )
     return metrics
 
 
