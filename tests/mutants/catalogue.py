@@ -45,6 +45,7 @@ CORRECTING = "eagle_rl/algorithms/correction.py"
 CORRECTING_RUNNER = "eagle_rl/runners/correcting.py"
 FEEDBACK = "eagle_rl/algorithms/feedback.py"
 TRIALS = "eagle_rl/evaluation/trials.py"
+FALLS = "eagle_rl/evaluation/falls.py"
 LOSSES = "eagle_rl/algorithms/losses.py"
 GAUSSIAN = "eagle_rl/models/distribution.py"
 PPO = "eagle_rl/algorithms/eagle_ppo.py"
@@ -315,6 +316,14 @@ MUTANTS: tuple[Mutant, ...] = (
     Mutant(SEARCH, "- weight @ self.mean", "", "learner/test_search.py"),
     Mutant(SEARCH, "noise + self.sign * noise", "noise + noise", "learner/test_search.py"),
     Mutant(SEARCH, "parity.abs() > MIN_PARITY", "parity.abs() >= 0.0", "learner/test_search.py"),
+    Mutant(
+        FALLS,
+        "(_, at_stop) = self._recent[-1], self._recent[0]",
+        "(_, at_stop) = self._recent[-1], self._recent[-1]",
+        "evaluation/test_falls.py",
+    ),
+    Mutant(FALLS, '"left" if left > 0', '"left" if left < 0', "evaluation/test_falls.py"),
+    Mutant(FALLS, "time_s=(step + 1)", "time_s=step", "evaluation/test_falls.py"),
     Mutant(TRIALS, "(disturbed, True)", "(disturbed, False)", "evaluation/test_trials.py"),
     Mutant(
         TRIALS,
