@@ -1,7 +1,7 @@
 """How robots fall: when, under which command, to which side, and which joints had nowhere left to go.
 
-This is the first thing to look at when a robot falls: joints at their stops mean that its posture is at fault, which no
-training mends (``docs/experiments.md``, 39).
+This is the first thing to look at when a robot falls: where the same joints are at their stops time and again, it is the
+posture that is at fault, and no training mends it (``docs/experiments.md``, 39).
 """
 
 from __future__ import annotations
@@ -61,12 +61,12 @@ class FallWatch:
         """Begin with nobody fallen, at steps of ``step_dt`` [s]."""
         self.falls: list[Fall] = []
         self._env, self._step_dt = env, step_dt
-        self._recent: deque[tuple[Tensor, Tensor]] = deque(maxlen=round(LOOK_BACK_S / step_dt))
+        self._recent: deque[tuple[Tensor, Tensor]] = deque(maxlen=max(1, round(LOOK_BACK_S / step_dt)))
 
     def look(self) -> None:
         """See how everybody stands, before a control step."""
         gravity, at_stop = self._env.balance()
-        self._recent.append((gravity.cpu(), at_stop.cpu()))
+        self._recent.append((gravity.to("cpu", copy=True), at_stop.cpu()))  # the state may be written to
 
     def note(self, step: int, command: Tensor, fell: Tensor) -> None:
         """Keep the falls of a control step.
