@@ -1,7 +1,7 @@
 """How robots fall: when, under which command, to which side, and which joints had nowhere left to go.
 
-This is the first thing to look at when a robot falls: where the same joints are at their stops time and again, it is the
-posture that is at fault, and no training mends it (``docs/experiments.md``, 39).
+This is the first thing to look at when a robot falls: where the same joints are at their stops time and again, the
+posture is at fault, and no training mends it (``docs/experiments.md``, 39).
 """
 
 from __future__ import annotations
