@@ -9,6 +9,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -40,7 +41,7 @@ class Share:
     def __getitem__(self, name: str) -> Tensor:
         return self.tensors[name]
 
-    @property
+    @cached_property
     def kind(self) -> Hashable:
         """What it has in common with its like: all that is computed of it depends on its tensors and on this alone."""
         return self.size, tuple(x.shape for x in self.tensors.values())

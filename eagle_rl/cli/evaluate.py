@@ -194,7 +194,9 @@ def main(argv: Sequence[str]) -> int:
             _store(args.out, method, result)
     table = tracking_table(results, args.subset, args.falls)
     falls = falls_table(falls_of(results))
-    print(to_markdown(table), *([falls] if falls else []), sep="\n")
+    print(to_markdown(table))
+    if falls:
+        print(falls)
     if args.out is not None:
         _write(args.out, table, falls)
     return 0

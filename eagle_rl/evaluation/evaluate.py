@@ -6,6 +6,7 @@ import dataclasses
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -138,16 +139,16 @@ def evaluate(
     for robot in robots:
         commands = draw_commands(task.commands, ev, robot, ev.num_envs_per_robot)
         judged = judged_commands(ev, ev.num_envs_per_robot)
-        parts, falls = [], []
+        parts: list[TrackingAccumulator] = []
+        falls: list[Fall] = []
         for start in range(0, ev.num_envs_per_robot, size):
             chunk = commands[start : start + size]
             env = make_env([robot], len(chunk), task, ev.seed, start)
             accumulator = TrackingAccumulator(judged[start : start + size])
             falls += _run_chunk(policy, env, chunk, accumulator, task, ev, on_step)
             parts.append(accumulator)
-        metrics[robot] = dataclasses.replace(
-            TrackingAccumulator.join(parts).finish(), falls=tuple(sorted(falls, key=_time))
-        )
+        falls.sort(key=attrgetter("time_s"))  # however environments were simulated together
+        metrics[robot] = dataclasses.replace(TrackingAccumulator.join(parts).finish(), falls=tuple(falls))
     return metrics
 
 
@@ -181,11 +182,6 @@ def _run_chunk(
         accumulator.add(env.tracking_errors().cpu(), command, fell, settled)
         on_step(len(command))
     return watch.falls
-
-
-def _time(fall: Fall) -> float:
-    """By which falls are sorted, so that it does not tell how environments were simulated together."""
-    return fall.time_s
 
 
 def tiled(policy: Policy, obs: TensorDict) -> Tensor:

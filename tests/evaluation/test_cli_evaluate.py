@@ -23,6 +23,7 @@ from eagle_rl.runners.provenance import Provenance, slot_table_hash
 from eagle_rl.runners.records import final_checkpoint
 from eagle_rl.runners.stages import run_experiment
 from envs.robots.slots import SLOT_NAMES
+from tests.evaluation.test_falls import FALL
 from tests.evaluation.test_report import result
 from tests.policy import untrained_checkpoint
 from tests.runners.toy_run import refuse
@@ -91,6 +92,17 @@ def test_a_run_becomes_a_table_with_hash_protocol_and_seed(run, tmp_path, capsys
 
 def test_a_policy_trained_on_one_core_is_judged_on_all_cores_of_this_machine(run):
     assert load_policy(run.run_dir).cfg.run.num_threads == 0, "the run's number of threads is of where it was trained"
+
+
+def test_how_robots_fell_is_printed_and_written_and_no_older_story_is_left(tmp_path, capsys):
+    calm = result((0.1,) * 5)
+    fallen = dataclasses.replace(calm.robots["h1"], falls=(FALL,))
+    for name, metrics, told in (("fallen", fallen, True), ("calm", calm.robots["h1"], False)):
+        stored = tmp_path / f"{name}.json"
+        stored.write_text(dataclasses.replace(calm, robots={"h1": metrics}).to_json())
+        assert main([f"EAGLE={stored}", "--out", str(tmp_path / "out")]) == 0
+        assert ("| h1 | EAGLE | 1 of 16 |" in capsys.readouterr().out) == told, name
+        assert (tmp_path / "out" / "falls.md").exists() == told, name
 
 
 def test_stored_results_are_tabled_without_simulating_again(run, tmp_path, capsys):
